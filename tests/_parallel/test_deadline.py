@@ -16,8 +16,8 @@ from tests.started import started
 
 
 @pytest.fixture(autouse=True)
-def default_interrupts():
-    """A background shell may ignore interrupts."""
+def default_interrupt_handler():
+    """Handle interrupts by default, which a background shell may ignore."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -28,7 +28,7 @@ posix = pytest.mark.skipif(os.name == "nt", reason="no POSIX signals")
 
 
 @pytest.fixture
-def one_copy():
+def one_worker():
     allow_copies(1)
     yield
     allow_copies(0)
@@ -61,7 +61,7 @@ def test_within_returns_none_after_the_time_limit():
 
 
 @posix
-def test_first_interrupt_stops_at_the_next_step_and_second_raises_keyboard_interrupt(monkeypatch):
+def test_the_first_interrupt_stops_at_the_next_step_and_the_second_raises_keyboard_interrupt(monkeypatch):
     monkeypatch.setattr("mkc_torch._parallel.deadline._SAME_INTERRUPT_S", 0.0)
     with stopped_by_interrupt(), limited():
         check_deadline()
@@ -116,8 +116,8 @@ def test_no_work_starts_after_the_deadline(copies):
 
 
 @linux
-@pytest.mark.usefixtures("one_copy")
-def test_deadline_ends_a_copy_that_is_waited_for():
+@pytest.mark.usefixtures("one_worker")
+def test_the_deadline_ends_a_worker_that_is_waited_for():
     here = os.getpid()
 
     def work():
@@ -131,8 +131,8 @@ def test_deadline_ends_a_copy_that_is_waited_for():
 
 
 @linux
-@pytest.mark.usefixtures("one_copy")
-def test_a_copy_stops_at_the_deadline_itself():
+@pytest.mark.usefixtures("one_worker")
+def test_a_worker_stops_at_the_deadline():
     def work():
         while True:
             check_deadline()
@@ -168,7 +168,7 @@ with stopped_by_interrupt(), limited():
 
 @linux
 @pytest.mark.process
-def test_interrupt_of_all_processes_stops_work_and_ends_copies():
+def test_an_interrupt_of_all_processes_stops_work_and_ends_workers():
     with started("-c", STOPPED) as process:
         for _ in range(2):
             process.stdout.readline()

@@ -1,4 +1,4 @@
-"""Work is shared by copies of a process; the results do not depend on the process that does it."""
+"""Work is shared by forked workers; the results do not depend on the process."""
 
 import multiprocessing
 import os
@@ -22,7 +22,7 @@ HERE = os.getpid()
 
 
 @pytest.fixture(autouse=True)
-def _copies(monkeypatch):
+def _two_workers(monkeypatch):
     # copies lack the threads of this process, so no work here computes with large tensors
     allow_copies(2)
     monkeypatch.setattr(pool, "_WORTH_S", -1.0)  # the works here are short
@@ -31,8 +31,8 @@ def _copies(monkeypatch):
     assert multiprocessing.active_children() == []
 
 
-def elsewhere(value):
-    """A work that returns a value and its process; slow enough for other processes to take the next work."""
+def slow_work(value):
+    """Return work that returns a value and its process, slow enough for other processes to take the next item."""
 
     def work():
         time.sleep(0.05)
@@ -41,19 +41,19 @@ def elsewhere(value):
     return work
 
 
-def test_results_come_in_order_and_copies_take_part():
-    results = shared([elsewhere(k) for k in range(9)])
+def test_results_are_in_order_and_computed_by_all_workers():
+    results = shared([slow_work(k) for k in range(9)])
     assert [value for value, _ in results] == list(range(9))
     assert len({process for _, process in results}) == 3
 
 
-def test_without_copies_this_process_does_all_work():
+def test_without_workers_all_work_is_done_in_the_main_process():
     allow_copies(0)
     assert shared([os.getpid, os.getpid]) == [HERE, HERE]
 
 
 @pytest.mark.parametrize("works", [6, 2])
-def test_works_that_take_less_time_than_a_fork_are_done_here(works, monkeypatch):
+def test_work_shorter_than_a_fork_is_done_in_the_main_process(works, monkeypatch):
     monkeypatch.setattr(pool, "_WORTH_S", 0.1)
     cheap = [os.getpid] * works
     shared(cheap)  # of two works, the cost has to be known
@@ -66,11 +66,11 @@ def test_nothing_is_forked_on_other_systems_than_linux(monkeypatch):
     assert shared([os.getpid, os.getpid]) == [HERE, HERE]
 
 
-def test_a_single_work_needs_no_copy():
+def test_a_single_work_item_needs_no_worker():
     assert shared([os.getpid]) == [HERE]
 
 
-def test_copies_do_not_fork_copies():
+def test_workers_fork_no_workers():
     def work():
         time.sleep(0.05)
         return {os.getpid(), *shared([os.getpid, os.getpid])}
@@ -78,13 +78,13 @@ def test_copies_do_not_fork_copies():
     assert all(len(processes) == 1 for processes in shared([work] * 6) if HERE not in processes)
 
 
-def test_work_with_an_unpicklable_result_is_done_here():
+def test_work_with_an_unpicklable_result_is_done_in_the_main_process():
     results = shared([lambda k=k: (os.getpid(), lambda: k) for k in range(6)])
     assert [value() for _, value in results] == list(range(6))
     assert {process for process, _ in results} == {HERE}
 
 
-def test_work_of_a_killed_copy_is_done_here():
+def test_work_of_a_killed_worker_is_done_in_the_main_process():
     def dies():
         if os.getpid() != HERE:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -93,7 +93,7 @@ def test_work_of_a_killed_copy_is_done_here():
     assert shared([dies] * 5) == [HERE] * 5
 
 
-def test_without_memory_for_a_copy_this_process_does_all_work(monkeypatch):
+def test_without_memory_for_a_worker_all_work_is_done_in_the_main_process(monkeypatch):
     def fails():
         raise BlockingIOError
 
@@ -101,12 +101,12 @@ def test_without_memory_for_a_copy_this_process_does_all_work(monkeypatch):
     assert shared([os.getpid] * 3) == [HERE] * 3
 
 
-def test_an_error_of_a_work_is_raised_here():
+def test_an_error_of_work_is_raised_in_the_main_process():
     def fails():
         raise ArithmeticError(f"in {os.getpid() == HERE}")
 
     with pytest.raises(ArithmeticError, match="in True"):
-        shared([elsewhere(1), elsewhere(2), elsewhere(3), fails])
+        shared([slow_work(1), slow_work(2), slow_work(3), fails])
 
 
 @pytest.mark.parametrize("most", [0, 2])
@@ -137,12 +137,12 @@ def test_known_objects_are_pickled_by_their_number():
         Serializer().packed(known[1])
 
 
-def test_copies_are_ended():
-    shared([elsewhere(k) for k in range(5)])
+def test_workers_are_ended_after_the_work():
+    shared([slow_work(k) for k in range(5)])
     assert multiprocessing.active_children() == []
 
 
-ENDED = """
+KILLED_PARENT = """
 import os, signal, sys, time
 from mkc_torch._parallel.pool import allow_copies, shared
 
@@ -160,8 +160,8 @@ except KeyboardInterrupt:
 
 @pytest.mark.process
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_the_end_of_this_process_ends_its_copies(number):
-    with started("-c", ENDED) as process:
+def test_a_killed_main_process_ends_its_workers(number):
+    with started("-c", KILLED_PARENT) as process:
         assert process.stdout is not None
         for _ in range(2):
             process.stdout.readline()

@@ -30,7 +30,7 @@ def test_tensors_work_with_kept_memory():
 
 
 @pytest.mark.process
-def test_linear_algebra_uses_one_thread():
+def test_linear_algebra_uses_a_single_thread():
     code = (
         "import torch, numpy\nfrom threadpoolctl import threadpool_info\n"
         "from mkc_torch._parallel.processes import one_thread\n"

@@ -20,7 +20,7 @@ def recorder():
         yield recorder
 
 
-def test_each_item_and_the_end_are_counted(recorder):
+def test_counted_reports_each_item_and_the_end(recorder):
     assert list(counted("ab", 2, "letter")) == ["a", "b"]
     assert recorder == [("letter", 0, 2), ("letter", 1, 2), ("letter", 2, 2)]
 
@@ -33,7 +33,7 @@ def test_unnamed_or_single_items_are_not_counted(recorder):
     assert recorder == []
 
 
-def test_a_function_receives_no_counts():
+def test_a_progress_function_without_count_receives_no_counts():
     stages = []
     with counting(stages.append):
         count("letter", 1, 2)
@@ -43,7 +43,7 @@ def test_a_function_receives_no_counts():
 @pytest.mark.parametrize(
     "copies", [0, pytest.param(1, marks=pytest.mark.skipif(sys.platform != "linux", reason="fork"))]
 )
-def test_shared_works_are_counted_but_not_their_inner_items(recorder, copies):
+def test_shared_work_is_counted_without_its_inner_items(recorder, copies):
     allow_copies(copies)
     try:
         results = shared([lambda: shared([lambda: 1, lambda: 2], thing="inner")] * 4, thing="outer")
@@ -56,6 +56,6 @@ def test_shared_works_are_counted_but_not_their_inner_items(recorder, copies):
         assert recorder == [("outer", done, 4) for done in range(5)]
 
 
-def test_inner_items_of_unnamed_works_are_counted(recorder):
+def test_inner_items_of_unnamed_work_are_counted(recorder):
     shared([lambda: list(counted("ab", 2, "letter")), lambda: None])
     assert recorder[-1] == ("letter", 2, 2)

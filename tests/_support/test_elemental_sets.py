@@ -16,7 +16,7 @@ def test_hash_is_splitmix64():
 
 
 @pytest.mark.parametrize(("size", "limit"), [(1, 1), (3, 3), (3, 7), (6, 300)])
-def test_numbers_of_a_set_are_distinct_and_below_the_limit(size, limit):
+def test_indices_of_a_set_are_distinct_and_below_the_limit(size, limit):
     sets = drawn_sets(5, 2000, size, limit, CPU)
     assert sets.shape == (2000, size)
     assert int(sets.min()) >= 0
@@ -33,7 +33,7 @@ def test_every_set_is_equally_probable():
     assert float((counts - 2000.0).square().sum() / 2000.0) < 27.9
 
 
-def test_first_sets_do_not_depend_on_their_number_and_seeds_differ(device):
+def test_first_sets_depend_on_the_seed_and_not_on_their_number(device):
     few, many = (drawn_sets(7, k, 3, 50, device) for k in (10, 1000))
     assert torch.equal(few, many[:10])
     assert torch.equal(few.cpu(), drawn_sets(7, 10, 3, 50, CPU))
@@ -41,7 +41,7 @@ def test_first_sets_do_not_depend_on_their_number_and_seeds_differ(device):
     assert torch.equal(drawn_samples(3, 20, 90, device).cpu(), drawn_samples(3, 20, 90, CPU))
 
 
-def test_sets_of_the_used_are_those_of_the_shorter_list():
+def test_sets_of_used_rows_equal_those_of_the_list_of_used_rows():
     used = torch.rand(4, 30, generator=torch.Generator().manual_seed(0)) < 0.7
     sets = drawn_of_used(2, 100, 3, used, 30, CPU)
     for mask, of_problem in zip(used, sets, strict=True):
@@ -63,7 +63,7 @@ def test_samples_are_distinct_and_ascending():
 
 
 @pytest.mark.parametrize("estimator", [LeastTrimmedSquares(), SRegression(), MKCRegression()], ids=repr)
-def test_a_fit_does_not_depend_on_the_batch_that_it_is_in(estimator, device):
+def test_a_fit_does_not_depend_on_its_batch(estimator, device):
     generator = torch.Generator().manual_seed(0)
     X = torch.randn(9, 40, 3, dtype=torch.float64, generator=generator).to(device)
     y = X.sum(-1) + torch.randn(9, 40, dtype=torch.float64, generator=generator).to(device)

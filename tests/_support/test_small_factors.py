@@ -33,7 +33,7 @@ def eye(n: int) -> Tensor:
 
 
 @pytest.mark.parametrize("n", SIZES)
-def test_basis_is_orthonormal_to_rounding_times_the_condition(n):
+def test_the_basis_is_orthonormal_up_to_rounding_times_the_condition_number(n):
     rows = sample(n, 50, 80, n) * torch.logspace(0, -4, n, dtype=torch.float64) @ sample(99, n, n)
     rows = rows / rows.abs().amax(-2, keepdim=True)
     upper, inverse, well = orthonormalising(rows)
@@ -61,7 +61,7 @@ def test_float32_rows_are_summed_in_float64():
 
 
 @pytest.mark.parametrize("n", SIZES)
-def test_eigenvalues_and_vectors_of_indefinite_matrices(n):
+def test_eigenvalues_and_vectors_of_indefinite_matrices_agree_with_lapack(n):
     matrix = sample(n, 40, n, n)
     matrix = matrix + matrix.mT
     values, vectors = symmetric_eigen(matrix)
@@ -78,14 +78,14 @@ def test_eigenvalues_and_vectors_of_indefinite_matrices(n):
     [torch.zeros(3, 3).double(), eye(4), 1e-200 * eye(2), 1e150 * (1.0 - eye(2))],
     ids=["zero", "identity", "tiny", "opposite eigenvalues"],
 )
-def test_eigenvalues_of_special_matrices(matrix):
+def test_eigenvalues_of_special_matrices_agree_with_lapack(matrix):
     values, vectors = symmetric_eigen(matrix)
     torch.testing.assert_close(values, torch.linalg.eigvalsh(matrix), rtol=1e-13, atol=0.0)
     torch.testing.assert_close(vectors @ torch.diag(values) @ vectors.mT, matrix, rtol=1e-13, atol=1e-13 * 1e150)
 
 
 @pytest.mark.parametrize("n", [2, 3, 7])
-def test_pseudo_inverse_of_singular_symmetric_matrices(n):
+def test_pseudo_inverses_of_singular_symmetric_matrices_agree_with_lapack(n):
     rows = sample(n, 20, n - 1, n)
     matrix = rows.mT @ rows - 0.5 * rows[:, :1].mT @ rows[:, :1]
     expected = torch.linalg.pinv(matrix, hermitian=True, rtol=1e-12)
@@ -95,7 +95,7 @@ def test_pseudo_inverse_of_singular_symmetric_matrices(n):
 
 
 @pytest.mark.parametrize("shape", [(4, 4), (2, 5), (5, 2)])
-def test_pseudo_inverse_of_any_matrices(shape):
+def test_pseudo_inverses_of_any_shape_agree_with_lapack(shape):
     matrix = sample(1, 10, *shape)
     torch.testing.assert_close(pinv(matrix), torch.linalg.pinv(matrix), rtol=1e-9, atol=1e-9)
 
@@ -130,7 +130,7 @@ def test_singular_systems_have_no_finite_solution_and_shared_matrices_are_expand
 
 
 @pytest.mark.parametrize("n", SIZES)
-def test_definite_systems_and_inverses(n):
+def test_definite_systems_and_inverses_agree_with_lapack(n):
     rows = sample(n, 30, 3 * n, n)
     gram, moment = rows.mT @ rows, sample(2, 30, n)
     torch.testing.assert_close(solve_gram(gram, moment), torch.linalg.solve(gram, moment), rtol=1e-8, atol=1e-10)
@@ -149,7 +149,7 @@ def test_an_indefinite_matrix_has_no_definite_inverse():
     torch.testing.assert_close(inverse, eye(2).expand(2, 2, 2))
 
 
-def test_a_removed_direction_leaves_a_solution_of_the_others():
+def test_a_singular_gram_system_has_the_least_squares_fit():
     rows = sample(0, 4, 9, 3)
     rows[..., 2] = rows[..., 0] - rows[..., 1]
     gram, target = rows.mT @ rows, sample(1, 4, 9, 1)
@@ -180,7 +180,7 @@ def test_the_choice_is_forced_only_within_the_context():
         assert side_by_side(torch.zeros(1, device="meta"))
 
 
-def test_items_at_once_follow_the_memory(monkeypatch):
+def test_the_batch_size_follows_the_memory(monkeypatch):
     before = at_once(torch.zeros(1), 10, 100)
     monkeypatch.setattr("mkc_torch._support.side_by_side._MEMORY", 1 << 20)
     assert 1 <= at_once(torch.zeros(1), 10, 100) < before

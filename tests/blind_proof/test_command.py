@@ -10,7 +10,7 @@ pytest.importorskip("jinja2")
 from examples.blind_proof import __main__ as command
 
 
-def adequate(paths, folder):
+def diagnose_adequate(paths, folder):
     for path in paths:
         (folder / path.stem).mkdir()
         reported = {"verdict": "adequate", "findings": []}
@@ -22,7 +22,7 @@ def run(*words):
 
 
 def test_scenarios_are_scored_and_printed_with_their_aims(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(command, "diagnose", adequate)
+    monkeypatch.setattr(command, "diagnose", diagnose_adequate)
     folder = tmp_path / "scenarios"
     words = ("equations_scenarios", "--empty", 3, "--cases", 1, "--seed", 4, "--workers", 1, "--output", folder)
     assert run(*words, "--only", "gusts", "--only", "useless") == 0

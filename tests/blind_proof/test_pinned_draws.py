@@ -1,4 +1,4 @@
-"""Draws for a seed stay what they were: stored figures are compared across versions."""
+"""Draws of a seed do not change: stored figures are compared across versions."""
 
 import pytest
 
@@ -47,7 +47,7 @@ PINNED = (
 
 
 @pytest.mark.parametrize("pinned", PINNED, ids=lambda pinned: " ".join(map(str, pinned[1:5])))
-def test_the_recording_and_its_hidden_effect_are_those_of_the_first_scored_runs(pinned):
+def test_pinned_seeds_draw_the_stored_recording_and_hidden_effect(pinned):
     proof, scenario, seed, index, hidden, number, sums, effect, z = pinned
     (drawn,) = PROOFS[proof].only([scenario]).scenarios
     case = drawn.draw(seed, index, hidden, number)

@@ -1,4 +1,4 @@
-"""Proofs from end to end, with a diagnosis that costs nothing, and once with a real one."""
+"""Blind proofs from end to end, with a stub of the diagnosis, and once with a real diagnosis."""
 
 import json
 import math
@@ -33,7 +33,7 @@ PROOFS = {
 }
 
 
-def cheap(paths, folder):
+def diagnose_stub(paths, folder):
     """Report adequate, unfit and a failure in turn, and check that the key is hidden."""
     output = folder.parent
     assert (output / "key_hash.txt").is_file()
@@ -49,15 +49,15 @@ def cheap(paths, folder):
         (folder / path.stem / "model.json").write_text("{}")
 
 
-def quiet(paths, folder):
+def no_diagnosis(paths, folder):
     """Write no diagnosis."""
 
 
-def failing(*_):
+def diagnose_raising(*_):
     raise RuntimeError("no more")
 
 
-def as_measured(model, path):
+def correct_stub(model, path):
     assert model.is_file()
     recording = Recording.read(path)
     return recording.columns | {f"field_{axis}": recording[f"mag_{axis}"] for axis in "xyz" if "mag_x" in recording}
@@ -73,13 +73,13 @@ def run(request, tmp_path_factory):
     proof = PROOFS[request.param]
     cases, empty = (1, 2) if proof.totals else (3, 3)
     result = run_proof(
-        proof, cheap, as_measured, cases=cases, empty=empty, seed=3, output=output,
+        proof, diagnose_stub, correct_stub, cases=cases, empty=empty, seed=3, output=output,
         progress=lambda stage, done, total: reported.append((stage, done, total)),
     )  # fmt: skip
     return proof, result, output, reported
 
 
-def test_the_hash_matches_the_key(run):
+def test_the_published_hash_matches_the_key(run):
     _, _, output, _ = run
     assert digest((output / "key.json").read_text().rstrip("\n")) == (output / "key_hash.txt").read_text().strip()
 
@@ -111,7 +111,7 @@ def test_names_and_simulations_do_not_reveal_the_hidden_physics(run):
     assert hides not in (sorted(hides), sorted(hides, reverse=True))
 
 
-def test_simulations_are_given_where_the_magnetometer_is_not_meant(run):
+def test_recordings_of_other_simulations_than_the_magnetometer_have_a_simulation_file(run):
     proof, result, output, _ = run
     given = {path.stem for path in (output / "simulations").iterdir()}
     if proof.name.startswith("equations"):
@@ -139,7 +139,7 @@ def test_a_failed_recording_has_its_reason_and_is_not_an_alarm(run):
 
 def test_an_exception_of_the_diagnosis_is_a_failure(tmp_path):
     proof = PROOFS["magnetometer_scenarios"].only(["white"])
-    result = run_proof(proof, failing, as_measured, cases=0, empty=1, output=tmp_path / "out")
+    result = run_proof(proof, diagnose_raising, correct_stub, cases=0, empty=1, output=tmp_path / "out")
     assert len(result.failed) == 1
     assert "no more" in next((tmp_path / "out" / "diagnoses").glob("*.error.txt")).read_text()
 
@@ -161,7 +161,7 @@ class Tags(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_the_page_is_whole_and_loads_nothing(run):
+def test_the_page_is_well_formed_and_loads_nothing(run):
     proof, _, output, _ = run
     tags = Tags()
     page = (output / "proof.html").read_text(encoding="utf-8")
@@ -182,7 +182,7 @@ def test_the_summary_has_every_aim(run):
 def test_a_larger_run_of_scenarios_contains_a_smaller_one(tmp_path):
     proof = PROOFS["magnetometer_scenarios"].only(["white"])
     small, large = (
-        run_proof(proof, quiet, as_measured, empty=n, cases=0, seed=3, output=tmp_path / str(n)) for n in (1, 3)
+        run_proof(proof, no_diagnosis, correct_stub, empty=n, cases=0, seed=3, output=tmp_path / str(n)) for n in (1, 3)
     )
     (item,) = small.cases
     same = next(case for case in large.cases if case.key.index == item.key.index)
@@ -196,22 +196,31 @@ def test_a_larger_run_of_scenarios_contains_a_smaller_one(tmp_path):
 
 @pytest.mark.process
 @pytest.mark.parametrize("name", ["magnetometer", "equations_scenarios"])
-def test_two_processes_draw_the_same(name, tmp_path):
+def test_draws_do_not_depend_on_the_number_of_processes(name, tmp_path):
     proof = PROOFS[name].only([] if name == "magnetometer" else ["gusts", "useless"])
     for workers in (1, 2):
-        run_proof(proof, quiet, as_measured, empty=1, cases=1, seed=3, output=tmp_path / str(workers), workers=workers)
+        run_proof(
+            proof,
+            no_diagnosis,
+            correct_stub,
+            empty=1,
+            cases=1,
+            seed=3,
+            output=tmp_path / str(workers),
+            workers=workers,
+        )
     assert (tmp_path / "1" / "key_hash.txt").read_text() == (tmp_path / "2" / "key_hash.txt").read_text()
 
 
-def test_a_folder_in_use_an_unknown_scenario_and_a_run_of_nothing_are_rejected(tmp_path):
+def test_a_folder_in_use_an_unknown_scenario_and_an_empty_run_are_rejected(tmp_path):
     with pytest.raises(ValueError, match=r"held .* white, coloured, wander"):
         PROOFS["magnetometer_scenarios"].only(["held"])
     with pytest.raises(ValueError, match="both 0"):
-        run_proof(PROOFS["magnetometer"], quiet, as_measured, cases=0, empty=0, output=tmp_path / "a")
+        run_proof(PROOFS["magnetometer"], no_diagnosis, correct_stub, cases=0, empty=0, output=tmp_path / "a")
     assert not (tmp_path / "a").exists()
     (tmp_path / "file").touch()
     with pytest.raises(FileExistsError, match="not empty"):
-        run_proof(PROOFS["magnetometer"], quiet, as_measured, cases=1, empty=1, output=tmp_path)
+        run_proof(PROOFS["magnetometer"], no_diagnosis, correct_stub, cases=1, empty=1, output=tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -225,11 +234,11 @@ def test_a_folder_in_use_an_unknown_scenario_and_a_run_of_nothing_are_rejected(t
         ("equations_scenarios", 5, 10, [(5, 10)] * 11 + [(0, 10)]),
     ],
 )
-def test_how_many_recordings_are_drawn(name, cases, empty, sizes):
+def test_sizes_of_scenarios_follow_the_arguments(name, cases, empty, sizes):
     assert [(hidden, without) for _, hidden, without in PROOFS[name].sizes(cases, empty)] == sizes
 
 
-def test_cases_of_a_single_scenario_have_the_address_of_their_number():
+def test_addresses_of_a_single_scenario_are_in_order_of_their_number():
     (scenario,) = PROOFS["magnetometer"].scenarios
     addresses = PROOFS["magnetometer"].addresses(1, 2, 3)
     assert addresses == [
@@ -249,7 +258,7 @@ def test_each_recording_is_compared_with_the_simulation_written_for_it(name, sim
     assert found == (str(tmp_path / simulation) if simulation else MAGNETOMETER)
 
 
-def test_a_failed_diagnosis_is_not_scored_by_an_older_one(tmp_path):
+def test_a_failed_diagnosis_removes_an_older_diagnosis(tmp_path):
     (tmp_path / "diagnoses" / "case_00000").mkdir(parents=True)
     (tmp_path / "recordings").mkdir()
     old = tmp_path / "diagnoses" / "case_00000" / "diagnosis.json"
@@ -262,7 +271,7 @@ def test_a_failed_diagnosis_is_not_scored_by_an_older_one(tmp_path):
 
 
 @pytest.mark.e2e
-def test_a_real_diagnosis_is_scored_and_its_model_runs_free(tmp_path):
+def test_a_real_diagnosis_is_scored_and_its_model_simulates_the_recording(tmp_path):
     output = tmp_path / "out"
     result = run_proof(PROOFS["equations"], jobs.diagnose, jobs.apply, cases=0, empty=1, seed=53, output=output)
     assert result.failed == []
@@ -275,6 +284,6 @@ def test_a_real_diagnosis_is_scored_and_its_model_runs_free(tmp_path):
         assert float((simulated[name] - measured[name]).abs().median()) < 0.05 * float(measured[name].std())
 
 
-def test_threads_are_left_alone(run):
+def test_a_run_does_not_change_the_number_of_threads(run):
     assert torch.get_num_threads() == 1
     assert all(math.isfinite(p) for row in run[1].scenarios for p in row.p_values)

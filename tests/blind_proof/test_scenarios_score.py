@@ -1,4 +1,4 @@
-"""The score of scenarios on diagnoses made up for it."""
+"""The score of scenarios, of diagnoses made by hand."""
 
 import dataclasses
 import json
@@ -12,22 +12,22 @@ from examples.blind_proof.page import held, proof_page, summary
 from examples.blind_proof.proof import Proof, Scenario
 from examples.blind_proof.score import score_proof
 from examples.blind_proof.scored_case import LEAST_DISTURBANCE
-from tests.blind_proof.test_key import example
+from tests.blind_proof.test_key import example_key
 
 SETTINGS = {"proof": "equations_scenarios", "seed": 1, "key_sha256": "0" * 64, "empty": 1, "hidden": 1}
 
 
-def never(*_):
+def never_drawn(*_):
     raise AssertionError
 
 
 SCENARIOS = Proof(
     "equations_scenarios",
     (
-        Scenario("white", "white noise", never, aims.WHITE),
-        Scenario("pushed_white", "white force noise", never, aims.DISTURBED_STATE),
-        Scenario("lasting", "one run", never, aims.LASTING, right="unexplained", share=1.0, apart=True),
-        Scenario("useless", "of no use", never, aims.USELESS, hides=False),
+        Scenario("white", "white noise", never_drawn, aims.WHITE),
+        Scenario("pushed_white", "white force noise", never_drawn, aims.DISTURBED_STATE),
+        Scenario("lasting", "one run", never_drawn, aims.LASTING, right="unexplained", share=1.0, apart=True),
+        Scenario("useless", "of no use", never_drawn, aims.USELESS, hides=False),
     ),
     empty=60,
     totals=aims.TOTALS,
@@ -38,7 +38,7 @@ def key(name, scenario="white", *, disturbance=0.0, useless="", kind="empty", ef
     rival = KeyRival("dead_zone", (), z_sep)
     truth = KeyEffect(effect, "", (), "", None, 1.0, (), z, z_sep, rival, (), ("input voltage",))
     plain = dataclasses.replace(
-        example(name), kind="useless" if useless else kind, effects=() if kind == "empty" else (truth,)
+        example_key(name), kind="useless" if useless else kind, effects=() if kind == "empty" else (truth,)
     )
     reported = KeyDisturbance("pushed_white", "speed", 0.1, "m/s²·√s", disturbance) if disturbance else None
     return dataclasses.replace(plain, scenario=scenario, disturbance=reported, useless=useless)
@@ -67,7 +67,7 @@ def aim(scored, measure):
     return next(m for m in scored.measured if m.threshold.measure == measure)
 
 
-def test_empty_recordings_of_an_ordinary_scenario():
+def test_false_alarms_are_confirmed_findings_in_empty_recordings():
     answers = {
         "quiet": answer("adequate"),
         "unconfirmed": answer("unexplained", finding("input_delay", "unconfirmed")),
@@ -112,7 +112,7 @@ def test_disturbed_states_are_located_by_process_noise_or_a_finding():
     assert held(aim(scored, "named")) == "not measured"
 
 
-def test_disturbances_of_a_sensor_have_no_state_to_be_located_in():
+def test_sensor_disturbances_are_not_counted_as_located_states():
     disturbed = dataclasses.replace(
         key("a", "pushed_white"), disturbance=KeyDisturbance("wander", "sensor", 1.0, "µT", 4.0)
     )
@@ -120,7 +120,7 @@ def test_disturbances_of_a_sensor_have_no_state_to_be_located_in():
     assert scored.shares["unexplained_located"].total == 0
 
 
-def test_useless_simulations_have_to_be_unfit_and_never_adequate():
+def test_useless_simulations_are_right_if_unfit_and_wrong_if_adequate():
     keys = [key(name, "useless", useless="wrong sign" if name < "c" else "another system") for name in "abcd"]
     answers = {"a": answer("unfit"), "b": answer("adequate"), "c": answer("unfit"), "d": None}
     result = score_proof(SCENARIOS, keys, answers)
@@ -134,7 +134,7 @@ def test_useless_simulations_have_to_be_unfit_and_never_adequate():
     assert all(m.holds for m in scenario(good, "useless").measured if m.threshold.measure != "empty")
 
 
-def test_names_of_what_is_hidden():
+def test_shares_of_named_effects_count_detectable_effects_only():
     answers = {
         "right": answer("explained", finding("backlash")),
         "wrong": answer("explained", finding("dead_zone")),
@@ -161,7 +161,7 @@ def test_names_of_what_is_hidden():
     assert scored.shares["false_alarms"].total == 0
 
 
-def test_outside_the_catalogue_only_a_wrong_name_is_wrong():
+def test_an_effect_outside_the_catalogue_is_wrong_only_with_a_confirmed_name():
     answers = {
         "claimed": answer("explained", finding("dead_zone")),
         "own": answer("explained", finding("vibration")),
@@ -230,9 +230,9 @@ def test_a_reported_drift_of_the_right_sensor_counts():
 
 
 @pytest.mark.parametrize(("share", "asked", "hidden"), [(1 / 3, None, 20), (1.0, None, 60), (1.0, 6, 6), (1 / 3, 6, 6)])
-def test_how_many_hide_something(share, asked, hidden):
-    assert Scenario("white", "", never, (), share=share).hidden(60, asked) == hidden
-    assert Scenario("useless", "", never, (), hides=False).hidden(60, asked) == 0
+def test_the_number_of_recordings_with_hidden_physics_follows_share_and_argument(share, asked, hidden):
+    assert Scenario("white", "", never_drawn, (), share=share).hidden(60, asked) == hidden
+    assert Scenario("useless", "", never_drawn, (), hides=False).hidden(60, asked) == 0
 
 
 def all_kinds():
@@ -246,14 +246,14 @@ def all_kinds():
     return score_proof(SCENARIOS, keys, answers)
 
 
-def test_the_total_is_of_useful_scenarios():
+def test_the_total_excludes_useless_scenarios():
     result = all_kinds()
     assert [w.name for w in result.scenarios] == ["white", "pushed_white", "useless"]
     assert (result.total.empty, result.total.hidden) == (2, 1)
     assert [m.threshold for m in result.total.measured] == list(aims.TOTALS)
 
 
-def test_numbers_are_json_with_a_row_for_each_case():
+def test_the_score_is_json_with_a_row_for_each_case():
     numbers = all_kinds().numbers()
     assert json.loads(json.dumps(numbers, allow_nan=False)) == numbers
     assert [case["verdict"] for case in numbers["cases"]] == ["adequate", "unexplained", "unfit", "failed"]

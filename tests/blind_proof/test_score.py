@@ -8,7 +8,7 @@ from examples.blind_proof.aims import THRESHOLDS, Threshold
 from examples.blind_proof.key import KeyEffect, KeyParameter, KeyRival
 from examples.blind_proof.score import SHARES, Score
 from examples.blind_proof.scored_case import scored
-from tests.blind_proof.test_key import example
+from tests.blind_proof.test_key import example_key
 
 
 def key(name, kind="single", *, effect="hard_iron_step", drivers=(), z=20.0, z_sep=15.0, **more):
@@ -17,7 +17,7 @@ def key(name, kind="single", *, effect="hard_iron_step", drivers=(), z=20.0, z_s
     truth = KeyEffect(effect, "", drivers, more.pop("withheld", ""), more.pop("onset", None), 1.0, parameters, z, z_sep,
                       rival, (rival,) if z_sep < 6 else ())  # fmt: skip
     effects = () if kind == "empty" else (truth, *more.pop("others", ()))
-    return dataclasses.replace(example(name), kind=kind, effects=effects)
+    return dataclasses.replace(example_key(name), kind=kind, effects=effects)
 
 
 def finding(effect, drivers=(), onset=None, parameters=(), alternatives=()):
@@ -29,7 +29,7 @@ def answer(*findings, verdict="explained", p_value=0.01):
     return {"verdict": verdict, "p_value": p_value, "findings": list(findings)}
 
 
-NOTHING = answer(verdict="adequate", p_value=0.5)
+ADEQUATE = answer(verdict="adequate", p_value=0.5)
 
 
 def score(keys, answers, ratios=(), thresholds=THRESHOLDS):
@@ -43,10 +43,10 @@ def measured(result, name):
 def test_false_alarms_are_claims_that_physics_is_missing():
     keys = [key(name, "empty") for name in "abcdef"]
     answers = {
-        "a": NOTHING,
+        "a": ADEQUATE,
         "b": answer(verdict="unexplained"),
         "c": answer(finding("offset_drift")),
-        "d": NOTHING,
+        "d": ADEQUATE,
         "f": answer(verdict="unfit"),
     }
     result = score(keys, answers)
@@ -67,7 +67,7 @@ def test_the_grade_decides_whether_a_finding_is_a_claim(grade, claimed):
     assert [b.found.count for b in result.power_z if b.found.total] == [1]
 
 
-def test_named_and_driver_right_among_the_strong():
+def test_shares_of_right_names_and_drivers_count_detectable_cases_only():
     keys = [
         key("right", effect="current_field", drivers=("current",)),
         key("driver", effect="current_field", drivers=("current",)),
@@ -78,7 +78,7 @@ def test_named_and_driver_right_among_the_strong():
         "right": answer(finding("current_field", ["current"])),
         "driver": answer(finding("current_field", ["aux_1"])),
         "wrong": answer(finding("offset_drift")),
-        "weak": NOTHING,
+        "weak": ADEQUATE,
     }
     result = score(keys, answers)
     assert result.strong == 3
@@ -86,7 +86,7 @@ def test_named_and_driver_right_among_the_strong():
     assert (result.shares["driver"].count, result.shares["driver"].total) == (1, 3)
 
 
-def test_an_inseparable_rival_is_right_and_a_separable_one_wrong():
+def test_an_inseparable_rival_is_right_and_a_separable_rival_is_wrong():
     keys = [key("below", z_sep=5.0), key("above", z_sep=9.0)]
     answers = {name: answer(finding("driver_offset", ["aux_1"])) for name in ("below", "above")}
     bins = {(b.low, b.high): b.named.count for b in score(keys, answers).power_z_sep}
@@ -102,17 +102,17 @@ def test_a_withheld_driver_is_named_by_its_time_course(named, right):
     assert list(result.confusion) == ["current_field, driver withheld"]
 
 
-def test_position_drives_a_gradient_in_any_part():
+def test_any_position_column_is_the_right_driver_of_a_gradient():
     hidden = key("a", effect="field_gradient", drivers=("position_x", "position_y", "position_z"))
     assert score([hidden], {"a": answer(finding("field_gradient", ["position_x"]))}).shares["driver"].count == 1
     assert score([hidden], {"a": answer(finding("field_gradient", []))}).shares["driver"].count == 0
 
 
-def test_time_and_field_are_no_drivers():
+def test_time_as_a_driver_is_ignored():
     assert score([key("a")], {"a": answer(finding("hard_iron_step", ["time"]))}).shares["driver"].count == 1
 
 
-def test_candidates_and_separable_share():
+def test_candidates_and_separable_share_count_inseparable_alternatives():
     other = {"effect": "offset_drift", "drivers": [], "separable": False}
     ruled_out = other | {"separable": True}
     answers = {
@@ -124,14 +124,14 @@ def test_candidates_and_separable_share():
     assert result.candidates == 1.5
 
 
-def test_onset_errors():
+def test_onset_errors_are_infinite_without_an_onset():
     keys = [key("a", onset=10.0), key("b", onset=10.0)]
     result = score(keys, {"a": answer(finding("hard_iron_step", onset=10.4)), "b": answer(finding("hard_iron_step"))})
     assert [case.onset_error for case in result.cases] == pytest.approx([0.4, math.inf])
     assert measured(result, "onsets_near").value == 0.5
 
 
-def test_onsets_lie_in_their_intervals_or_not():
+def test_onset_coverage_counts_onsets_outside_or_without_an_interval_as_missed():
     keys = [key(name, onset=10.0) for name in "abcd"]
     answers = {
         "a": answer(finding("hard_iron_step", onset=10.4) | {"onset_interval": [9.9, 10.6]}),
@@ -143,7 +143,7 @@ def test_onsets_lie_in_their_intervals_or_not():
     assert (result.shares["onset_covered"].count, result.shares["onset_covered"].total) == (1, 3)
 
 
-def test_intervals_of_ninety_per_cent():
+def test_coverage_counts_components_within_their_90_per_cent_interval():
     truth = (KeyParameter("offset_change", [1.0, 2.0, 3.0], "µT", True),)
     stated = {"name": "step", "value": [1.0, 2.16, 3.17], "standard_error": [0.1, 0.1, 0.1], "unit": "µT"}
     keys = [key("a", parameters=truth), key("b", parameters=truth)]
@@ -164,69 +164,69 @@ def test_parameters_that_are_not_scored_do_not_count():
     assert not measured(result, "coverage").holds
 
 
-def test_power_over_bins():
+def test_power_is_counted_in_bins_of_z():
     keys = [key(str(z), z=z, z_sep=z) for z in (2.0, 4.0, 12.0, 14.0, 100.0)]
-    answers = dict.fromkeys(("2.0", "4.0", "12.0"), NOTHING)
+    answers = dict.fromkeys(("2.0", "4.0", "12.0"), ADEQUATE)
     answers |= {name: answer(finding("hard_iron_step")) for name in ("14.0", "100.0")}
     bins = [(b.named.count, b.named.total) for b in score(keys, answers).power_z]
     assert bins == [(0, 1), (0, 1), (0, 0), (0, 0), (1, 2), (0, 0), (1, 1)]
 
 
-def test_two_at_once_are_counted_once_each():
+def test_of_two_hidden_effects_each_is_counted_once():
     second = key("x", effect="offset_drift").effects
     keys = [key(name, "double", others=second) for name in "abc"]
     answers = {
         "a": answer(finding("offset_drift"), finding("hard_iron_step")),
         "b": answer(finding("hard_iron_step"), finding("hard_iron_step")),
-        "c": NOTHING,
+        "c": ADEQUATE,
     }
     assert score(keys, answers).doubles == {0: 1, 1: 1, 2: 1}
 
 
-def at(places, effect="coulomb_friction", **more):
-    """A key whose effect acts at one of several places."""
+def key_at(places, effect="coulomb_friction", **more):
+    """Return a key whose effect acts at several ports."""
     hidden = key("a", effect=effect, **more)
     return dataclasses.replace(hidden, effects=(dataclasses.replace(hidden.effects[0], at=tuple(places)),))
 
 
 def test_located_right_counts_effects_with_several_ports():
     reported = finding("coulomb_friction") | {"channels": ["rate of speed"]}
-    right, wrong = at(["rate of speed", "rate of turn"]), at(["rate of turn"])
+    right, wrong = key_at(["rate of speed", "rate of turn"]), key_at(["rate of turn"])
     assert score([right], {"a": answer(reported)}).shares["at_port"].count == 1
     assert score([wrong], {"a": answer(reported)}).shares["at_port"].count == 0
     assert score([wrong], {"a": answer(reported)}).shares["driver"].total == 0
     assert score([key("a")], {"a": answer(finding("hard_iron_step"))}).shares["at_port"].total == 0
 
 
-def test_an_inseparable_rival_is_right_at_its_own_place():
+def test_an_inseparable_rival_is_right_at_its_port_only():
     rival = KeyRival("linear_drag", (), 3.0, ("rate of speed",))
-    hidden = at(["rate of turn"])
+    hidden = key_at(["rate of turn"])
     hidden = dataclasses.replace(hidden, effects=(dataclasses.replace(hidden.effects[0], inseparable=(rival,)),))
     for place, right in (("rate of speed", 1), ("rate of lift", 0)):
         result = score([hidden], {"a": answer(finding("linear_drag") | {"channels": [place]})})
         assert (result.shares["named"].count, result.shares["at_port"].count) == (right, right)
 
 
-def test_other_thresholds_can_be_given():
+def test_thresholds_can_be_replaced():
     thresholds = (Threshold("at_port", 0.5, 1.0, "somewhere"),)
     reported = finding("coulomb_friction") | {"channels": ["rate of turn"]}
-    (found,) = score([at(["rate of turn"])], {"a": answer(reported)}, thresholds=thresholds).measured
+    (found,) = score([key_at(["rate of turn"])], {"a": answer(reported)}, thresholds=thresholds).measured
     assert found.holds
 
 
-def test_second_ratio_is_the_median_of_the_strong():
+def test_the_second_ratio_is_the_median_of_detectable_cases():
     keys = [key("a"), key("b"), key("c"), key("weak", z=3.0, z_sep=3.0)]
     result = score(keys, {}, {"a": 1.0, "b": 1.02, "c": math.inf, "weak": 9.0})
     assert measured(result, "second_ratio").value == pytest.approx(1.02)
 
 
-def test_nothing_measured_holds_no_threshold_and_is_json():
+def test_an_empty_score_holds_no_threshold_and_is_json():
     result = score([], {})
     assert not any(m.holds for m in result.measured)
     json.dumps(result.numbers(), allow_nan=False)
 
 
-def test_thresholds_are_ranges():
+def test_thresholds_have_unique_measures_and_inclusive_ranges():
     assert len({threshold.measure for threshold in THRESHOLDS}) == len(THRESHOLDS)
     assert all(threshold.measure in SHARES or hasattr(Score, threshold.measure) for threshold in THRESHOLDS)
     inside = Threshold("a", 0.85, 0.95, "")

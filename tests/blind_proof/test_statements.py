@@ -25,5 +25,5 @@ ANGLE, SPEED = {"size": 0.5, "standard_error": 0.4, "unit": "rad/s"}, {"size": 0
         ({"findings": [{"effect": "unknown"}, {"channels": ["rate of level"]}]}, None),
     ],
 )
-def test_the_driven_state_is_read_from_what_is_there(diagnosis, state):
+def test_the_driven_state_is_read_from_incomplete_diagnoses(diagnosis, state):
     assert driven_state(diagnosis) == state

@@ -1,4 +1,4 @@
-"""What `mkc calibrate` is at, sensor by sensor, and that it reads a file once."""
+"""Stages that `mkc calibrate` reports for each sensor; a file is read once."""
 
 import pytest
 import torch
@@ -15,8 +15,8 @@ from tests.calibration.test_calibrate import noisy_ellipsoid
 
 
 @pytest.fixture
-def reads(monkeypatch):
-    """The files that are read, each as often as it is."""
+def files_read(monkeypatch):
+    """Return a list to which the name of each file is added when it is read."""
     found = []
 
     def counted(path):
@@ -28,15 +28,15 @@ def reads(monkeypatch):
     return found
 
 
-def asked(**given):
+def request(**given):
     return CalibrationRequest(**({"columns": {}, "units": {}, "sensor": None, "field_strength": None} | given))
 
 
-def test_each_sensor_of_a_file_is_reported_and_the_file_is_read_once(tmp_path, reads):
+def test_stages_name_each_sensor_and_a_file_is_read_once(tmp_path, files_read):
     points, stages = noisy_ellipsoid(300), []
     columns = {f"mag{n}_{axis}": points[:, k] + n for n in range(2) for k, axis in enumerate("xyz")}
     write_table(tmp_path / "two.csv", {"time": torch.arange(300) / 50.0} | columns)
-    outcomes = list(calibrations_of(tmp_path / "two.csv", tmp_path / "o", asked(), force=False, step=stages.append))
+    outcomes = list(calibrations_of(tmp_path / "two.csv", tmp_path / "o", request(), force=False, step=stages.append))
     assert [isinstance(outcome, calibration_files.CalibrationOutcome) for _, outcome in outcomes] == [True, True]
     assert stages == [
         "reading two.csv",
@@ -45,11 +45,13 @@ def test_each_sensor_of_a_file_is_reported_and_the_file_is_read_once(tmp_path, r
         "calibrating two.csv, sensor mag1 (2 of 2)",
         "drawing the report on two.csv, sensor mag1 (2 of 2)",
     ]
-    assert reads == ["two.csv"]
+    assert files_read == ["two.csv"]
 
 
-def test_a_file_that_is_absent_is_one_outcome(tmp_path):
+def test_an_absent_file_is_a_single_failed_outcome(tmp_path):
     stages = []
-    ((subject, error),) = calibrations_of(tmp_path / "a.csv", tmp_path / "o", asked(), force=False, step=stages.append)
+    ((subject, error),) = calibrations_of(
+        tmp_path / "a.csv", tmp_path / "o", request(), force=False, step=stages.append
+    )
     assert (subject, type(error)) == (str(tmp_path / "a.csv"), FileNotFoundError)
     assert stages == ["reading a.csv"]

@@ -14,16 +14,15 @@ pytest.importorskip("typer")
 pytest.importorskip("polars")
 pytest.importorskip("jsonschema")
 
-from typer.testing import CliRunner
 
 from mkc_torch._support import files as _files
 from mkc_torch.cli import diagnosis_files
-from mkc_torch.cli.app import app
 from mkc_torch.cli.console import ConsoleStyle
 from mkc_torch.cli.diagnose import _waited_for
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.io.diagnosis_json import validate
 from mkc_torch.recording.recording import Recording, write_table
+from tests.cli.commands import assert_refused, mkc
 from tests.diagnosis.factory import make_diagnosis
 from tests.started import started
 
@@ -33,29 +32,12 @@ QUICK = ("--simulation", "magnetometer", "--surrogates", "19")
 QUIET, STEPPED = 3, 1
 
 
-def mkc(*arguments):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
-
-
-def diagnosed(*arguments):
+def diagnose_magnetometer(*arguments):
     return mkc("diagnose", *arguments, *QUICK)
 
 
-def refused(result, *words, code=1, lines=1):
-    """A failure in one line that holds the words, without a traceback."""
-    assert result.exit_code == code, result.output
-    assert result.exception is None or isinstance(result.exception, SystemExit)
-    assert "Traceback" not in result.output
-    if code == 1:
-        # a busy machine reports progress too
-        assert len([line for line in result.stderr.strip().splitlines() if "mkc: after " not in line]) == lines
-    flat = " ".join(result.stderr.replace("│", " ").split())
-    for word in words:
-        assert word in flat, flat
-
-
-def sensor(seed, *, step=0.0, count=500, start=0.0):
-    """A magnetometer that is turned by hand for 20 s, and from the ninth on has another offset."""
+def sensor_columns(seed, *, step=0.0, count=500, start=0.0):
+    """Return the columns of a magnetometer turned by hand for 20 s, with a step of its offset at 9 s."""
     g = torch.Generator().manual_seed(seed)
     t = torch.arange(count, dtype=torch.float64) / 25.0
     speed = 0.4 + 1.2 * torch.rand(4, 3, generator=g, dtype=torch.float64)
@@ -72,9 +54,9 @@ def table(path, columns):
     return path
 
 
-def quiet(path, **changes):
-    """A recording in which nothing is missing, with columns changed, added, or by None left out."""
-    columns = sensor(QUIET) | changes
+def quiet_table(path, **changes):
+    """Write a recording without missing physics; columns can be changed, added, or removed by None."""
+    columns = sensor_columns(QUIET) | changes
     return table(path, {name: values for name, values in columns.items() if values is not None})
 
 
@@ -83,8 +65,8 @@ def content_of(folder):
 
 
 def warnings_of(path, output, *more):
-    """Warnings and notes of a diagnosis; the terminal shows the same warnings."""
-    result = diagnosed(path, "--output", output, *more)
+    """Return warnings and notes of a diagnosis, and assert that the terminal shows the same warnings."""
+    result = diagnose_magnetometer(path, "--output", output, *more)
     assert result.exit_code == 0, result.output
     content = content_of(output / path.stem)
     assert ("warning" in result.stdout) == bool(content["warnings"])
@@ -92,17 +74,17 @@ def warnings_of(path, output, *more):
 
 
 @pytest.fixture(scope="module")
-def stepped(tmp_path_factory):
-    """A recording with a step in it, the folder of its diagnosis, and what was printed."""
+def step_diagnosis(tmp_path_factory):
+    """Return a recording with a step, the folder of its diagnosis, and the printed text."""
     folder = tmp_path_factory.mktemp("stepped")
-    path = table(folder / "stepped.csv", sensor(STEPPED, step=1.0))
-    result = diagnosed(path, "--output", folder / "out", "--seed", "5")
+    path = table(folder / "stepped.csv", sensor_columns(STEPPED, step=1.0))
+    result = diagnose_magnetometer(path, "--output", folder / "out", "--seed", "5")
     assert result.exit_code == 0, result.output
     return path, folder / "out" / "stepped", result
 
 
-def test_files_and_summary(stepped):
-    path, folder, result = stepped
+def test_diagnose_writes_its_files_and_a_summary(step_diagnosis):
+    path, folder, result = step_diagnosis
     assert sorted(p.name for p in folder.iterdir()) == WRITTEN
     content = content_of(folder)
     validate(content)
@@ -120,9 +102,9 @@ def test_files_and_summary(stepped):
     assert "hard-iron step" in page
 
 
-def test_the_model_corrects_a_second_recording(stepped, tmp_path):
-    _, folder, _ = stepped
-    new = table(tmp_path / "new.csv", sensor(7, step=1.0, start=100.0))
+def test_the_model_corrects_a_second_recording(step_diagnosis, tmp_path):
+    _, folder, _ = step_diagnosis
+    new = table(tmp_path / "new.csv", sensor_columns(7, step=1.0, start=100.0))
     output = tmp_path / "corrected.csv"
     result = mkc("apply", folder / "model.json", new, "--output", output)
     assert result.exit_code == 0, result.output
@@ -137,9 +119,9 @@ def test_the_model_corrects_a_second_recording(stepped, tmp_path):
     assert "warning" not in result.stdout
 
 
-def test_the_model_knows_the_unit_and_the_length_of_its_field(stepped, tmp_path):
-    _, folder, _ = stepped
-    new = sensor(7, step=1.0, start=100.0)
+def test_the_model_has_the_unit_and_the_strength_of_the_field(step_diagnosis, tmp_path):
+    _, folder, _ = step_diagnosis
+    new = sensor_columns(7, step=1.0, start=100.0)
     other = table(tmp_path / "other.csv", {n: 1e3 * v if n.startswith("mag_") else v for n, v in new.items()})
     result = mkc("apply", folder / "model.json", other, "--output", tmp_path / "corrected.csv")
     assert " µT of the calibrated recording; check the unit" in result.stdout
@@ -151,11 +133,13 @@ def test_the_model_knows_the_unit_and_the_length_of_its_field(stepped, tmp_path)
     assert "warning" not in result.stdout
 
 
-def test_apply_distinguishes_models_from_other_files(stepped, tmp_path):
-    path, folder, _ = stepped
+def test_apply_distinguishes_models_from_other_files(step_diagnosis, tmp_path):
+    path, folder, _ = step_diagnosis
     out = ("--output", tmp_path / "o.csv")
-    refused(mkc("apply", folder / "diagnosis.json", path, *out), "diagnosis.json", "model.json in the same folder")
-    refused(mkc("apply", folder, path, *out), "this is a folder", "model.json")
+    assert_refused(
+        mkc("apply", folder / "diagnosis.json", path, *out), "diagnosis.json", "model.json in the same folder"
+    )
+    assert_refused(mkc("apply", folder, path, *out), "this is a folder", "model.json")
     content = json.loads((folder / "model.json").read_text(encoding="utf-8"))
     for change, words in (
         ({"schema": "mkc-model/9"}, ['its schema is "mkc-model/9"', "mkc diagnose"]),
@@ -164,55 +148,55 @@ def test_apply_distinguishes_models_from_other_files(stepped, tmp_path):
         ({"parameters": "none"}, ["damaged"]),
     ):
         (tmp_path / "odd.json").write_text(json.dumps(content | change), encoding="utf-8")
-        refused(mkc("apply", tmp_path / "odd.json", path, *out), "odd.json", *words)
+        assert_refused(mkc("apply", tmp_path / "odd.json", path, *out), "odd.json", *words)
     (tmp_path / "odd.json").write_text("[1, 2", encoding="utf-8")
-    refused(mkc("apply", tmp_path / "odd.json", path, *out), "not JSON")
+    assert_refused(mkc("apply", tmp_path / "odd.json", path, *out), "not JSON")
     assert not (tmp_path / "o.csv").exists()
 
 
-def test_existing_results_are_kept_without_force(stepped):
-    path, folder, _ = stepped
+def test_existing_results_are_kept_without_force(step_diagnosis):
+    path, folder, _ = step_diagnosis
     before = {p.name: p.read_bytes() for p in folder.iterdir()}
-    refused(diagnosed(path, "--output", folder.parent), "not empty", "--force")
+    assert_refused(diagnose_magnetometer(path, "--output", folder.parent), "not empty", "--force")
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
 
 
 @pytest.mark.e2e
 def test_force_replaces_results_and_keeps_other_files(tmp_path):
-    path, folder = quiet(tmp_path / "a.csv"), tmp_path / "a"
+    path, folder = quiet_table(tmp_path / "a.csv"), tmp_path / "a"
     folder.mkdir()
     for name in (*WRITTEN, "notes.txt"):
         (folder / name).write_text("mine")
-    refused(diagnosed(path, "--output", tmp_path, "--force"), "not written by mkc")
+    assert_refused(diagnose_magnetometer(path, "--output", tmp_path, "--force"), "not written by mkc")
     for name in WRITTEN:
         (folder / name).write_text('{"schema": "mkc-diagnosis/1"} Made by mkc_torch')
-    assert diagnosed(path, "--output", tmp_path, "--force").exit_code == 0
+    assert diagnose_magnetometer(path, "--output", tmp_path, "--force").exit_code == 0
     assert sorted(p.name for p in folder.iterdir()) == sorted((*WRITTEN, "notes.txt"))
     assert (folder / "notes.txt").read_text() == "mine"
     assert content_of(folder)["verdict"] == "adequate"
 
 
 @pytest.mark.e2e
-def test_no_time_column(tmp_path):
-    assert "no column `time`" in warnings_of(quiet(tmp_path / "a.csv", time=None), tmp_path / "out")
+def test_a_missing_time_column_is_warned_of(tmp_path):
+    assert "no column `time`" in warnings_of(quiet_table(tmp_path / "a.csv", time=None), tmp_path / "out")
 
 
 @pytest.mark.e2e
-def test_a_clock_that_jumps(tmp_path):
-    clock = sensor(QUIET)["time"]
+def test_gaps_repeated_and_reversed_times_are_warned_of(tmp_path):
+    clock = sensor_columns(QUIET)["time"]
     clock[250:] += 5.0
     clock[[10, 11]] = clock[[11, 10]]
     clock[50] = clock[49]
-    reported = warnings_of(quiet(tmp_path / "a.csv", time=clock), tmp_path / "out")
+    reported = warnings_of(quiet_table(tmp_path / "a.csv", time=clock), tmp_path / "out")
     for words in ("ran backwards 1 time", "Dropped 1 of 500 samples that repeat", "1 gap of more than"):
         assert words in reported
 
 
 @pytest.mark.e2e
-def test_columns_that_can_drive_nothing(tmp_path):
+def test_constant_empty_and_copied_columns_are_warned_of(tmp_path):
     slope = torch.linspace(20.0, 30.0, 500, dtype=torch.float64)
     slope = slope + 0.1 * torch.randn(500, generator=torch.Generator().manual_seed(0))
-    path = quiet(
+    path = quiet_table(
         tmp_path / "a.csv",
         temperature=slope,
         copy=2.0 * slope + 1.0,
@@ -227,16 +211,16 @@ def test_columns_that_can_drive_nothing(tmp_path):
 @pytest.mark.e2e
 @pytest.mark.parametrize(("factor", "unit", "option"), [(0.01, "gauss", "gauss"), (1000.0, "nanotesla", "nT")])
 def test_other_units_are_refused_or_converted(tmp_path, factor, unit, option):
-    scaled = {name: factor * sensor(QUIET)[name] for name in AXES}
-    path = quiet(tmp_path / "a.csv", **scaled)
-    refused(diagnosed(path, "--output", tmp_path / "out"), unit, f"`--convert mag={option}`")
+    scaled = {name: factor * sensor_columns(QUIET)[name] for name in AXES}
+    path = quiet_table(tmp_path / "a.csv", **scaled)
+    assert_refused(diagnose_magnetometer(path, "--output", tmp_path / "out"), unit, f"`--convert mag={option}`")
     assert f"converted from {option}" in warnings_of(path, tmp_path / "own", "--convert", f"mag={option}")
     assert content_of(tmp_path / "own" / "a")["baseline"]["rmse"] == pytest.approx(0.3, rel=0.2)
 
 
 @pytest.mark.e2e
 def test_raw_counts_are_reported_and_keep_their_name(tmp_path):
-    path = quiet(tmp_path / "a.csv", **{name: 100.0 * sensor(QUIET)[name] for name in AXES})
+    path = quiet_table(tmp_path / "a.csv", **{name: 100.0 * sensor_columns(QUIET)[name] for name in AXES})
     assert "may be raw counts" in warnings_of(path, tmp_path / "out")
     assert warnings_of(path, tmp_path / "own", "--unit-label", "counts") == ""
     assert content_of(tmp_path / "own" / "a")["baseline"]["rmse"] == pytest.approx(30.0, rel=0.2)
@@ -252,51 +236,51 @@ def test_raw_counts_are_reported_and_keep_their_name(tmp_path):
         ({"time": torch.full((500,), math.nan)}, 500, ["no sample has a finite time"]),
     ],
 )
-def test_bad_recordings_are_refused_in_one_sentence(tmp_path, changes, rows, words):
-    columns = {name: values for name, values in (sensor(QUIET) | changes).items() if values is not None}
+def test_bad_recordings_are_refused_in_a_sentence(tmp_path, changes, rows, words):
+    columns = {name: values for name, values in (sensor_columns(QUIET) | changes).items() if values is not None}
     path = table(tmp_path / "bad.csv", {name: values[:rows] for name, values in columns.items()})
-    refused(diagnosed(path, "--output", tmp_path / "out"), f"mkc: {path}: ", *words)
+    assert_refused(diagnose_magnetometer(path, "--output", tmp_path / "out"), f"mkc: {path}: ", *words)
     assert not (tmp_path / "out" / "bad").exists()
 
 
-def test_a_sensor_at_rest(tmp_path):
+def test_a_sensor_at_rest_has_the_advice_to_turn_it(tmp_path):
     generator = torch.Generator().manual_seed(0)
     still = {name: 20.0 + 0.3 * torch.randn(150, generator=generator, dtype=torch.float64) for name in AXES}
     path = table(tmp_path / "a.csv", {"time": torch.arange(150) / 25.0} | still)
-    result = diagnosed(path, "--output", tmp_path / "out")
+    result = diagnose_magnetometer(path, "--output", tmp_path / "out")
     assert result.exit_code == 1 or "warning" in result.stdout
     assert "Turn the sensor" in result.output
 
 
 @pytest.mark.e2e
 def test_one_failing_recording_does_not_stop_the_other(tmp_path):
-    good, bad = quiet(tmp_path / "good.csv"), tmp_path / "bad.csv"
+    good, bad = quiet_table(tmp_path / "good.csv"), tmp_path / "bad.csv"
     bad.write_text("time,mag_x,mag_y,mag_z\n0,1,two,3\n")
-    result = diagnosed(bad, good, "--output", tmp_path / "out")
-    refused(result, f"mkc: {bad}: column `mag_y` holds text", "1 of 2 recordings were not diagnosed", lines=2)
+    result = diagnose_magnetometer(bad, good, "--output", tmp_path / "out")
+    assert_refused(result, f"mkc: {bad}: column `mag_y` holds text", "1 of 2 recordings were not diagnosed", lines=2)
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["good"]
     assert sorted(p.name for p in (tmp_path / "out" / "good").iterdir()) == WRITTEN
     assert "good against magnetometer" in result.stdout
 
 
 @pytest.mark.e2e
-def test_experiments_are_diagnosed_each_on_its_own(tmp_path):
-    long, short = sensor(QUIET), {name: values[:20] for name, values in sensor(QUIET).items()}
+def test_runs_of_a_file_are_diagnosed_separately(tmp_path):
+    long, short = sensor_columns(QUIET), {name: values[:20] for name, values in sensor_columns(QUIET).items()}
     columns = {name: torch.cat([long[name], short[name]]) for name in long}
     path = table(tmp_path / "a.csv", columns)
     text = path.read_text(encoding="utf-8").splitlines()
     labels = ["run", *["flight/1"] * 500, *["2"] * 20]
     path.write_text("\n".join(f"{a},{b}" for a, b in zip(text, labels, strict=True)), encoding="utf-8")
-    result = diagnosed(path, "--output", tmp_path / "out", "--run-column", "run")
-    refused(result, f"{path}, run 2: 20 samples are too few", "1 of 2 recordings", lines=2)
+    result = diagnose_magnetometer(path, "--output", tmp_path / "out", "--run-column", "run")
+    assert_refused(result, f"{path}, run 2: 20 samples are too few", "1 of 2 recordings", lines=2)
     assert [p.name for p in (tmp_path / "out" / "a").iterdir()] == ["flight_1"]
     assert content_of(tmp_path / "out" / "a" / "flight_1")["recording"] == "a/flight/1"
 
 
 @pytest.mark.e2e
 def test_recordings_are_diagnosed_together(tmp_path):
-    a, b = quiet(tmp_path / "a.csv"), table(tmp_path / "b.csv", sensor(QUIET + 1, start=7.0))
-    result = diagnosed(a, b, "--together", "--output", tmp_path / "out")
+    a, b = quiet_table(tmp_path / "a.csv"), table(tmp_path / "b.csv", sensor_columns(QUIET + 1, start=7.0))
+    result = diagnose_magnetometer(a, b, "--together", "--output", tmp_path / "out")
     assert result.exit_code == 0, result.output
     assert "a, b against magnetometer" in result.stdout
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["together"]
@@ -306,39 +290,46 @@ def test_recordings_are_diagnosed_together(tmp_path):
     validate(content)
     assert (content["recording"], content["samples"]) == (["a", "b"], 1000)
     assert "a, b" in (folder / "report.html").read_text(encoding="utf-8")
-    refused(diagnosed(a, b, "--together", "--output", tmp_path / "out"), "together", "--force")
+    assert_refused(diagnose_magnetometer(a, b, "--together", "--output", tmp_path / "out"), "together", "--force")
 
 
-def test_recordings_that_differ_are_not_diagnosed_together(tmp_path):
-    a, b = quiet(tmp_path / "a.csv"), quiet(tmp_path / "b.csv", current=torch.ones(500))
-    refused(
-        diagnosed(a, b, "--together", "--output", tmp_path / "out"),
+def test_recordings_of_different_columns_are_not_diagnosed_together(tmp_path):
+    a, b = quiet_table(tmp_path / "a.csv"), quiet_table(tmp_path / "b.csv", current=torch.ones(500))
+    assert_refused(
+        diagnose_magnetometer(a, b, "--together", "--output", tmp_path / "out"),
         "b and a cannot be diagnosed together; their columns differ: b has `current`, which a has not.",
     )
     assert not list((tmp_path / "out").iterdir())
 
 
-def test_a_recording_that_cannot_be_read_keeps_all_from_being_diagnosed_together(tmp_path):
-    a, bad = quiet(tmp_path / "a.csv"), tmp_path / "bad.csv"
+def test_together_fails_if_a_recording_cannot_be_read(tmp_path):
+    a, bad = quiet_table(tmp_path / "a.csv"), tmp_path / "bad.csv"
     bad.write_text("time,mag_x,mag_y,mag_z\n0,1,two,3\n")
-    refused(diagnosed(a, bad, "--together", "--output", tmp_path / "out"), f"mkc: {bad}: column `mag_y` holds text")
+    assert_refused(
+        diagnose_magnetometer(a, bad, "--together", "--output", tmp_path / "out"),
+        f"mkc: {bad}: column `mag_y` holds text",
+    )
     assert not (tmp_path / "out" / "together").exists()
 
 
 @pytest.mark.e2e
-def test_columns_of_the_users_own(tmp_path):
-    columns = {name.replace("mag_", "u"): values for name, values in sensor(QUIET).items()}
+def test_columns_of_other_names_are_given_by_option(tmp_path):
+    columns = {name.replace("mag_", "u"): values for name, values in sensor_columns(QUIET).items()}
     path = table(tmp_path / "a.csv", columns)
-    refused(diagnosed(path, "--output", tmp_path / "out"), "no magnetometer", "`--columns mag_x=ux,mag_y=uy,mag_z=uz`")
+    assert_refused(
+        diagnose_magnetometer(path, "--output", tmp_path / "out"),
+        "no magnetometer",
+        "`--columns mag_x=ux,mag_y=uy,mag_z=uz`",
+    )
     names = ("--columns", "mag_x=ux,mag_y=uy,mag_z=uz")
-    assert diagnosed(path, "--output", tmp_path / "out", *names).exit_code == 0
+    assert diagnose_magnetometer(path, "--output", tmp_path / "out", *names).exit_code == 0
 
 
 def test_usage_errors_exit_with_two(tmp_path):
-    path, out = quiet(tmp_path / "a.csv"), ("--output", tmp_path / "out")
+    path, out = quiet_table(tmp_path / "a.csv"), ("--output", tmp_path / "out")
     known = ("--simulation", "magnetometer")
     (tmp_path / "b").mkdir()
-    twin = quiet(tmp_path / "b" / "A.csv")
+    twin = quiet_table(tmp_path / "b" / "A.csv")
     for arguments, words in (
         ((*known, *out), "REC"),
         ((path, *out, "--simulation", "pendulum"), '"pendulum" is unknown; give magnetometer'),
@@ -358,29 +349,29 @@ def test_usage_errors_exit_with_two(tmp_path):
         ((path, *out, *known, "--columns", "mag_x"), "mag_x=mx"),
         ((path, twin, *out, *known), "would both write into"),
     ):
-        refused(mkc("diagnose", *arguments), words, code=2)
+        assert_refused(mkc("diagnose", *arguments), words, code=2)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_low_level_gets_as_many_surrogates_as_it_needs(tmp_path, monkeypatch):
+def test_the_number_of_surrogates_follows_the_level(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(diagnosis_files, "diagnose", lambda *_, **given: asked.append(given) or 1 / 0)
-    path = quiet(tmp_path / "a.csv")
+    path = quiet_table(tmp_path / "a.csv")
     for level, surrogates in (("0.05", 99), ("0.001", 999)):
         result = mkc("diagnose", path, "--simulation", "magnetometer", "--output", tmp_path, "--level", level)
         assert (asked[-1]["level"], asked[-1]["surrogates"]) == (float(level), surrogates)
-    refused(result, "internal error (ZeroDivisionError in test_diagnose.py", "report it")
+    assert_refused(result, "internal error (ZeroDivisionError in test_diagnose.py", "report it")
     assert not (tmp_path / "a").exists()
 
 
-def test_a_write_that_fails_leaves_no_half_file(stepped, tmp_path, monkeypatch):
+def test_a_failed_write_leaves_no_partial_file(step_diagnosis, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device", "model.json")
 
     diagnosis = make_diagnosis(1, model=None)
     monkeypatch.setattr(diagnosis_files, "diagnose", lambda *_, **__: diagnosis)
     monkeypatch.setattr(_files.os, "fsync", full)
-    refused(diagnosed(stepped[0], "--output", tmp_path / "out"), "no space left")
+    assert_refused(diagnose_magnetometer(step_diagnosis[0], "--output", tmp_path / "out"), "no space left")
     assert not (tmp_path / "out" / "stepped").exists()
 
 
@@ -392,10 +383,12 @@ def test_without_a_model_an_old_model_file_is_removed(tmp_path):
 
 
 @pytest.mark.e2e
-def test_text_for_a_terminal_is_set_to_its_width(stepped):
+def test_text_for_a_terminal_is_styled(step_diagnosis):
     request = diagnosis_files.Request(surrogates=19, force=True, report=False)
-    folder = stepped[1].parent / "wide"
-    (outcome,) = diagnosis_files.diagnose_file(stepped[0], folder, request, ConsoleStyle(terminal=True, width=60))
+    folder = step_diagnosis[1].parent / "wide"
+    (outcome,) = diagnosis_files.diagnose_file(
+        step_diagnosis[0], folder, request, ConsoleStyle(terminal=True, width=60)
+    )
     assert "\x1b[" in outcome.text
     assert sorted(path.name for path in folder.iterdir()) == WRITTEN[:2]
 
@@ -403,7 +396,7 @@ def test_text_for_a_terminal_is_set_to_its_width(stepped):
 @pytest.mark.process
 @pytest.mark.skipif(os.name == "nt", reason="signals are another thing there")
 def test_an_interrupt_ends_all_processes_and_leaves_nothing(tmp_path):
-    recordings = [quiet(tmp_path / f"{name}.csv") for name in "abcdef"]
+    recordings = [quiet_table(tmp_path / f"{name}.csv") for name in "abcdef"]
     out = tmp_path / "out"
     command = ("-m", "mkc_torch.cli", "diagnose", *recordings, "--output", out, *QUICK)
     environment = os.environ | {"PYTHONIOENCODING": "utf-8", "FORCE_COLOR": "1"}
@@ -418,7 +411,7 @@ def test_an_interrupt_ends_all_processes_and_leaves_nothing(tmp_path):
     assert [path.name for path in out.rglob("*") if path.is_file() and path.name not in WRITTEN] == []
 
 
-def test_a_process_that_dies_is_reported(tmp_path):
+def test_a_killed_worker_process_is_reported(tmp_path):
     def died():
         raise BrokenProcessPool
 
@@ -427,6 +420,6 @@ def test_a_process_that_dies_is_reported(tmp_path):
     assert "the process ended" in outcome.text
 
 
-def test_commands_that_draw_nothing_import_no_pictures():
+def test_the_command_line_does_not_import_matplotlib():
     code = "import sys, mkc_torch.cli.app as c; sys.exit(any(m in sys.modules for m in ('matplotlib', 'jinja2')))"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0

@@ -12,30 +12,27 @@ from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.diagnosis.result import EffectParameter, EvidenceResult, Region
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.evidence import SECTIONS, Row, Section
+from tests.cli.commands import flat
 from tests.diagnosis.factory import (
     graded,
     make_diagnosis,
     make_environment,
-    make_follows,
+    make_goodness_of_fit,
     make_unfit,
-    nearest,
+    with_another_shape,
     with_evidence,
 )
 
 
-def shown(diagnosis, files=(), *, width=100, terminal=False, paths=None):
+def summary_text(diagnosis, files=(), *, width=100, terminal=False, paths=None):
     stream = io.StringIO()
     console = Console(file=stream, width=width, force_terminal=terminal, highlight=False)
     show(console, diagnosis, [Path(file) for file in files], paths)
     return stream.getvalue()
 
 
-def flat(text):
-    return " ".join(text.split())
-
-
-def test_a_finding_in_a_dozen_lines():
-    text = shown(make_diagnosis(1), ["out/flight_07/diagnosis.json"])
+def test_the_summary_of_a_finding_has_size_evidence_advice_and_files():
+    text = summary_text(make_diagnosis(1), ["out/flight_07/diagnosis.json"])
     assert len(text.strip().splitlines()) <= 25
     for words in (
         "flight_07 against magnetometer",
@@ -62,30 +59,30 @@ def test_a_finding_in_a_dozen_lines():
         assert words in flat(text)
 
 
-def test_where_in_the_states_a_finding_lies():
+def test_the_summary_has_the_region_and_the_runs_of_a_finding():
     made = make_diagnosis(1)
     region = Region("speed", "rad/s", "near zero", 0.31, 0.82, 0.2)
     finding = dataclasses.replace(made.findings[0], region=region, experiments=(0.9, 0.1))
-    text = flat(shown(dataclasses.replace(made, findings=(finding,))))
+    text = flat(summary_text(dataclasses.replace(made, findings=(finding,))))
     assert "mostly 82 % of the gain, in 20 % of the time: speed within ±0.310 rad/s" in text
     assert "in run 1: 90 %, run 2: 10 %" in text
 
 
-def test_nothing_found():
-    text = flat(shown(make_diagnosis(0)))
+def test_the_summary_without_findings_has_p_value_and_advice():
+    text = flat(summary_text(make_diagnosis(0)))
     assert "The recording shows no missing physics." in text
     assert "how sure p = 0.37, corrected for 64 candidates, level 0.05" in text
     assert "to do The simulation can be used" in text
 
 
-def test_a_command_is_not_broken_so_that_it_can_be_copied():
+def test_commands_are_not_wrapped():
     paths = top.RunPaths(f"/data/{'long_' * 30}.csv", "results/model.json", ())
-    text = shown(make_diagnosis(1), paths=paths)
+    text = summary_text(make_diagnosis(1), paths=paths)
     assert any(f"mkc apply results/model.json {paths.recording} --output" in line for line in text.splitlines())
 
 
 def test_several_findings_are_numbered():
-    text = shown(make_diagnosis(3))
+    text = summary_text(make_diagnosis(3))
     for line in (
         "1  hard-iron step: left out of the simulation",
         "2  current field (current): left out of the simulation",
@@ -98,15 +95,15 @@ def test_several_findings_are_numbered():
     assert text.count("0 is no improvement") == 1
 
 
-def test_structure_that_remains():
-    text = flat(shown(make_diagnosis(0, verdict="unexplained", p_value=0.005)))
+def test_the_summary_states_structure_without_a_finding():
+    text = flat(summary_text(make_diagnosis(0, verdict="unexplained", p_value=0.005)))
     assert "The residual has structure that no effect in the catalogue explains." in text
 
 
-def test_texts_from_files_neither_style_nor_steer_the_terminal():
+def test_markup_and_escape_codes_in_texts_from_files_have_no_effect():
     diagnosis = make_diagnosis(1, recording="[red]a[/red]\x1b[2J", warnings=("[/] \x1b]0;x\x07", "x" * 300))
     first = dataclasses.replace(diagnosis.findings[0], drivers=("[b]\x1b[2J",))
-    text = shown(dataclasses.replace(diagnosis, findings=(first,)))
+    text = summary_text(dataclasses.replace(diagnosis, findings=(first,)))
     assert "\x1b" not in text
     assert "\x07" not in text
     assert "[red]a[/red]" in text
@@ -115,58 +112,58 @@ def test_texts_from_files_neither_style_nor_steer_the_terminal():
 
 def test_long_paths_stay_on_one_line_and_many_warnings_are_counted():
     path = "folder/" * 20 + "report.html"
-    text = shown(make_diagnosis(0, warnings=tuple(f"warning {i}" for i in range(40))), [path], width=80)
+    text = summary_text(make_diagnosis(0, warnings=tuple(f"warning {i}" for i in range(40))), [path], width=80)
     assert any(line.endswith(path) for line in text.splitlines())
     assert "36 more; see report.html" in flat(text)
 
 
 @pytest.mark.parametrize("width", [40, 60, 200])
-def test_every_width(width):
-    text = shown(make_diagnosis(3), width=width, terminal=True)
+def test_the_summary_fits_terminals_of_any_width(width):
+    text = summary_text(make_diagnosis(3), width=width, terminal=True)
     assert "hard-iron step" in text
 
 
-def test_each_test_of_evidence_has_a_line(monkeypatch):
+def test_every_test_of_evidence_has_a_row(monkeypatch):
     section = Section((Row("remaining", "white"), Row("in print", "more", in_terminal=False)))
     monkeypatch.setitem(SECTIONS, "my_test", lambda _: section)
     said = EvidenceResult("my_test", "white")
     made = make_diagnosis(1)
     of_finding = dataclasses.replace(made, findings=(with_evidence(made.findings[0], said),))
     for diagnosis in (with_evidence(made, said), of_finding):
-        text = shown(diagnosis)
+        text = summary_text(diagnosis)
         assert "remaining white" in flat(text)
         assert "in print" not in text
 
 
-def test_without_a_smooth_correction_there_is_no_line_of_it():
-    assert "smooth correction" not in shown(make_diagnosis(1, ceiling=None))
+def test_an_absent_smooth_correction_is_omitted():
+    assert "smooth correction" not in summary_text(make_diagnosis(1, ceiling=None))
 
 
-def test_a_rare_p_value_contradicts_an_adequate_verdict():
-    text = flat(shown(make_diagnosis(0, p_value=0.04)))
+def test_a_significant_p_value_of_an_adequate_diagnosis_is_in_the_headline():
+    text = flat(summary_text(make_diagnosis(0, p_value=0.04)))
     assert "no missing physics" not in text
     assert "The strongest candidate is significant" in text
     assert "how sure p = 0.04" in text
 
 
-def test_a_long_list_of_numbers_shows_its_largest():
+def test_a_long_parameter_shows_its_largest_component():
     made = make_diagnosis(1)
     slopes = EffectParameter("gradient", (0.1, -0.6, 3.0, 0.2, 0.3, 0.4, 0.5), (0.1,) * 7, "µT/m", tuple("abcdefg"))
     text = flat(
-        shown(dataclasses.replace(made, findings=(dataclasses.replace(made.findings[0], parameters=(slopes,)),)))
+        summary_text(dataclasses.replace(made, findings=(dataclasses.replace(made.findings[0], parameters=(slopes,)),)))
     )
     assert "size gradient, largest c: 3.00 ± 0.10 µT/m further parameters: see the report" in text
 
 
-def answers(diagnosis):
-    """The first lines, up to what is left without a name."""
-    text = flat(shown(diagnosis, width=200))
+def first_lines(diagnosis):
+    """Return the first lines, up to the unexplained structure."""
+    text = flat(summary_text(diagnosis, width=200))
     return text[: text.index("unexplained") + 80] if "unexplained" in text else text
 
 
-def test_the_four_answers_stand_first():
+def test_fit_noise_named_and_unexplained_come_first():
     quiet = make_diagnosis(0, simulation="Pendulum", environment=make_environment(process_noise=(), disturbance=()))
-    assert answers(quiet).startswith(
+    assert first_lines(quiet).startswith(
         "flight_07 against Pendulum The recording shows no missing physics. "
         "fit angle: residual 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of the variance "
         "noise The residual is the sensor's noise. Input hold: `torque` is constant between samples. named "
@@ -174,18 +171,18 @@ def test_the_four_answers_stand_first():
     )
 
 
-def test_process_noise_is_located_before_any_finding():
+def test_process_noise_is_in_the_headline_with_its_state():
     disturbed = make_diagnosis(
         0, simulation="Pendulum", verdict="unexplained", p_value=0.4, environment=make_environment()
     )
-    text = answers(disturbed)
+    text = first_lines(disturbed)
     assert "Pendulum Process noise acts on the rate of `rate`, and no physics in the catalogue" in text
     assert "noise Process noise on the rate of `rate`: 0.228 ± 0.021 rad/s², correlation time 0.7 s" in text
     assert "named nothing unexplained the rate of `rate`" in text
 
 
-def test_a_simulation_that_does_not_follow_names_nothing():
-    text = flat(shown(make_unfit(), width=200))
+def test_the_summary_of_a_poor_fit_names_no_physics():
+    text = flat(summary_text(make_unfit(), width=200))
     assert text.startswith("flight_07 against Pendulum The simulation does not fit the recording. fit angle: the")
     assert "explains 12 % of the variance; RMSE 0.360 rad, of the output's mean 0.350 rad" in text
     assert "why Another start reaches 0.006 rad" in text
@@ -194,17 +191,23 @@ def test_a_simulation_that_does_not_follow_names_nothing():
         assert words not in text
 
 
-def test_what_is_only_nearest_or_not_confirmed_is_not_called_named():
+def test_nearest_and_unconfirmed_findings_are_not_listed_as_named():
     made = make_diagnosis(1, verdict="unexplained")
-    for change, grade in ((nearest, "nearest in the catalogue"), (lambda f: graded(f, "unconfirmed"), "not conf")):
-        text = flat(shown(dataclasses.replace(made, findings=(change(made.findings[0]),)), width=200))
+    for change, grade in (
+        (with_another_shape, "nearest in the catalogue"),
+        (lambda f: graded(f, "unconfirmed"), "not conf"),
+    ):
+        text = flat(summary_text(dataclasses.replace(made, findings=(change(made.findings[0]),)), width=200))
         assert f"named nothing confirmed; hard-iron step: {grade}" in text
         assert "unexplained unnamed structure" in text
-    shape = flat(shown(dataclasses.replace(made, findings=(nearest(made.findings[0]),)), width=200))
+    shape = flat(summary_text(dataclasses.replace(made, findings=(with_another_shape(made.findings[0]),)), width=200))
     assert "gains 163 nats (p = 0.002 if the name is right); 0.0071 |x|^1.52 sign(x)" in shape
 
 
 def test_each_output_has_its_own_unit():
-    followed = (make_follows(), make_follows("rate", "rad/s", 0.03, 1.4, 0.02, floor_source="quantisation"))
-    text = flat(shown(make_diagnosis(0, environment=make_environment(goodness_of_fit=followed)), width=200))
+    followed = (
+        make_goodness_of_fit(),
+        make_goodness_of_fit("rate", "rad/s", 0.03, 1.4, 0.02, floor_source="quantisation"),
+    )
+    text = flat(summary_text(make_diagnosis(0, environment=make_environment(goodness_of_fit=followed)), width=200))
     assert "rate: residual 0.0300 rad/s; noise floor 0.0200 rad/s (resolution of the recording)" in text

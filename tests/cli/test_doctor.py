@@ -33,7 +33,7 @@ def test_every_extra_is_listed_with_its_packages():
     assert not {name for name in extras if name not in listed} - COLLECTIONS - {"docs", "dev", "device"}
 
 
-def test_a_missing_extra_is_named_with_what_it_brings_and_how_to_install_it(monkeypatch):
+def test_a_missing_extra_is_listed_with_its_purpose_and_installation(monkeypatch):
     monkeypatch.setattr(doctor, "_installed", lambda package: package != "fmpy")
     text = CliRunner().invoke(app, ["doctor"]).output
     assert "missing fmpy; simulations in FMUs" in text
@@ -41,7 +41,7 @@ def test_a_missing_extra_is_named_with_what_it_brings_and_how_to_install_it(monk
     assert mkc_torch.__version__ in text
 
 
-def test_the_list_of_commands_has_whole_sentences_at_80_columns():
+def test_command_descriptions_are_complete_sentences_at_80_columns():
     text = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80"}).output
     text = text.partition("Options:")[2]
     assert "..." not in text

@@ -9,7 +9,8 @@ pytest.importorskip("fmpy")
 
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation import load_simulation
-from tests.cli.test_own_simulation import flat, mkc, tank_table
+from tests.cli.commands import flat, mkc
+from tests.cli.test_own_simulation import tank_table
 from tests.simulation.fmu.made import COMPILER, Model, make_fmu
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no compiler of C (cc, gcc or clang)")
@@ -21,7 +22,7 @@ TANK = Model(
     ("inflow",),
     units={"level": "m", "inflow": "m/s"},
 )
-"""That of tests/cli/test_own_simulation.py."""
+"""The tank of tests/cli/test_own_simulation.py."""
 
 
 @pytest.mark.slow

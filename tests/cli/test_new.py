@@ -1,4 +1,4 @@
-"""`mkc new-simulation` and `mkc new-effect`: what they write works as written."""
+"""`mkc new-simulation` and `mkc new-effect`: the generated files work."""
 
 import subprocess
 import sys
@@ -7,18 +7,13 @@ import pytest
 
 pytest.importorskip("typer")
 
-from typer.testing import CliRunner
 
-from mkc_torch.cli.app import app
 from mkc_torch.simulation import load_simulation
-
-
-def mkc(*arguments):
-    return CliRunner().invoke(app, [str(item) for item in arguments])
+from tests.cli.commands import mkc
 
 
 @pytest.mark.parametrize(("command", "kind"), [("new-simulation", "Dynamics"), ("new-effect", "GainEffect")])
-def test_two_files_are_written_and_nothing_is_replaced(tmp_path, monkeypatch, command, kind):
+def test_new_writes_two_files_and_replaces_none_without_force(tmp_path, monkeypatch, command, kind):
     monkeypatch.chdir(tmp_path)
     result = mkc(command, "two_kites")
     assert result.exit_code == 0, result.output
@@ -48,7 +43,7 @@ def test_two_files_are_written_and_nothing_is_replaced(tmp_path, monkeypatch, co
         ("Kite", "in lower case, kite"),
     ],
 )
-def test_names_that_would_not_work(tmp_path, monkeypatch, name, words):
+def test_invalid_module_names_are_refused(tmp_path, monkeypatch, name, words):
     monkeypatch.chdir(tmp_path)
     for command in ("new-simulation", "new-effect"):
         result = mkc(command, name)
@@ -57,14 +52,14 @@ def test_names_that_would_not_work(tmp_path, monkeypatch, name, words):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_simulation_can_be_named_on_the_command_line(tmp_path):
+def test_a_new_simulation_can_be_loaded_by_file_and_class(tmp_path):
     assert mkc("new-simulation", "kite", "--output", tmp_path).exit_code == 0
     assert load_simulation(f"{tmp_path / 'kite.py'}:Kite").states == ("position", "speed")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["new-simulation", "new-effect"])
-def test_their_own_tests_pass(tmp_path, command):
+def test_generated_tests_pass(tmp_path, command):
     assert mkc(command, "kite", "--output", tmp_path).exit_code == 0
     words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "."]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=280)

@@ -1,4 +1,4 @@
-"""`mkc diagnose` and `mkc apply` with a simulation of the user's own, and with what a simulator wrote."""
+"""`mkc diagnose` and `mkc apply` with a simulation of the user, and with the output of a simulator."""
 
 import importlib.util
 import json
@@ -10,14 +10,13 @@ pytest.importorskip("typer")
 pytest.importorskip("polars")
 pytest.importorskip("jsonschema")
 
-from typer.testing import CliRunner
 
-from mkc_torch.cli.app import app
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.io.diagnosis_json import validate
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.recording.recording import Recording, write_table
 from mkc_torch.simulation import SimulationFileError, load_simulation
+from tests.cli.commands import flat, mkc
 
 STATIC = """
 from mkc_torch.simulation import Static
@@ -46,15 +45,7 @@ class Tank(Dynamics):
 """
 
 # what a reader of a report on anything but a magnetometer has to be spared
-FOREIGN = ("magnetometer", "µT", "sensor axes", "field on the axis", "corrected field")
-
-
-def mkc(*arguments):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
-
-
-def flat(text):
-    return " ".join(text.split())
+MAGNETOMETER_WORDS = ("magnetometer", "µT", "sensor axes", "field on the axis", "corrected field")
 
 
 def thermistor_table(path, *, count=250):
@@ -68,7 +59,7 @@ def thermistor_table(path, *, count=250):
 
 
 def tank_table(path, *, drag=0.0, seed=0):
-    """Two runs of a vessel that also loses by the square of its level."""
+    """Write two runs of a vessel with a hidden loss by the square of its level."""
     g = torch.Generator().manual_seed(seed)
     time = torch.arange(150, dtype=torch.float64) / 10.0
     runs = []
@@ -106,7 +97,7 @@ def tank(tmp_path_factory):
 
 
 @pytest.mark.e2e
-def test_a_dynamics_diagnosis_reads_well(tank):
+def test_a_dynamics_diagnosis_is_free_of_magnetometer_words(tank):
     folder, _, result = tank
     place = folder / "out" / "runs"
     assert sorted(p.name for p in place.iterdir()) == ["corrected.py", "diagnosis.json", "model.json", "report.html"]
@@ -121,7 +112,7 @@ def test_a_dynamics_diagnosis_reads_well(tank):
     assert first["parameters"][0]["unit"] == "1/(m·s)"
     assert first["parameters"][0]["value"] == pytest.approx(0.15, rel=0.2)
     page = (place / "report.html").read_text(encoding="utf-8")
-    for words in FOREIGN:
+    for words in MAGNETOMETER_WORDS:
         assert words not in result.stdout
         assert words not in page
     assert "acts on the rate of level" in result.stdout
@@ -149,7 +140,7 @@ def test_a_model_simulates_another_recording(tank, tmp_path):
 
 
 @pytest.mark.e2e
-def test_the_python_that_is_written_runs_and_gives_the_same(tank):
+def test_exported_python_simulates_as_apply_does(tank):
     folder, source, _ = tank
     place = folder / "out" / "runs"
     text = (place / "corrected.py").read_text(encoding="utf-8")
@@ -172,8 +163,8 @@ def test_the_python_that_is_written_runs_and_gives_the_same(tank):
 
 
 @pytest.mark.e2e
-def test_what_was_corrected_is_diagnosed_again_from_anywhere(tank, tmp_path, monkeypatch):
-    """From where the base class lies, from the results, and from elsewhere; and what comes of it once more."""
+def test_a_corrected_simulation_loads_from_any_folder_and_is_diagnosed_again(tank, tmp_path, monkeypatch):
+    """From the folder of the base class, from the results, and from elsewhere; the result can be corrected again."""
     folder, _, _ = tank
     place = folder / "out" / "runs"
     text = (place / "corrected.py").read_text(encoding="utf-8")
@@ -204,7 +195,7 @@ def test_what_was_corrected_is_diagnosed_again_from_anywhere(tank, tmp_path, mon
 
 
 @pytest.mark.e2e
-def test_without_a_simulation_columns_decide(thermistor, tmp_path):
+def test_the_default_simulation_is_a_magnetometer_if_its_columns_are_present(thermistor, tmp_path):
     _, table, output = thermistor
     result = mkc("diagnose", table, "--output", output)
     assert result.exit_code == 1
@@ -223,7 +214,7 @@ def test_without_a_simulation_columns_decide(thermistor, tmp_path):
     assert content["simulation"] == "magnetometer"
 
 
-def test_a_function_of_inputs(thermistor):
+def test_a_static_simulation_is_diagnosed(thermistor):
     source, table, output = thermistor
     result = mkc("diagnose", table, "--simulation", source, "--output", output, "--surrogates", 19)
     assert result.exit_code == 0, result.output
@@ -233,11 +224,11 @@ def test_a_function_of_inputs(thermistor):
     assert content["simulation"] == "Thermistor"
     assert content["findings"][0]["drivers"] == ["current"]
     page = (folder / "report.html").read_text(encoding="utf-8")
-    assert not any(words in page + result.stdout for words in FOREIGN)
+    assert not any(words in page + result.stdout for words in MAGNETOMETER_WORDS)
 
 
 @pytest.mark.e2e
-def test_columns_are_renamed_and_the_unit_is_the_magnetometers(thermistor, tmp_path):
+def test_columns_can_be_renamed_and_unit_labels_are_refused(thermistor, tmp_path):
     source, table, output = thermistor
     known = Recording.read(table)
     other = tmp_path / "other.csv"
@@ -277,7 +268,7 @@ def test_noise_and_inputs_are_declared_by_name(thermistor, monkeypatch):
 
 
 @pytest.mark.e2e
-def test_what_a_simulator_wrote(tmp_path):
+def test_a_simulator_output_is_diagnosed_and_corrected(tmp_path):
     def signal(time):
         return torch.sin(1.1 * time) + 0.6 * torch.sin(2.7 * time + 1.0)
 
@@ -326,7 +317,7 @@ def test_failing_code_is_reported_and_nothing_is_written(tmp_path, text, name, w
     assert not list((tmp_path / "out").rglob("*")) if (tmp_path / "out").exists() else True
 
 
-def test_usage_errors(thermistor):
+def test_invalid_simulation_options_exit_with_two(thermistor):
     source, table, output = thermistor
     for more, words in (
         (("--simulation", source, "--simulator-output", table), "give one of --simulation and --simulator-output"),
@@ -361,7 +352,7 @@ def decay_table(path, *, zero=False):
 
 
 @pytest.mark.e2e
-def test_a_declared_input_that_is_not_used_is_no_crash(tmp_path):
+def test_an_unused_input_is_diagnosed(tmp_path):
     (tmp_path / "decay.py").write_text(UNUSED)
     command = ("--simulation", f"{tmp_path / 'decay.py'}:Decay", "--output", tmp_path / "out", "--surrogates", 19)
     result = mkc("diagnose", decay_table(tmp_path / "run.csv"), *command)
@@ -369,7 +360,7 @@ def test_a_declared_input_that_is_not_used_is_no_crash(tmp_path):
     assert "internal error" not in flat(result.stderr)
 
 
-def test_an_output_that_is_zero_throughout_is_refused_with_words(tmp_path):
+def test_an_output_of_zeros_is_refused_in_a_sentence(tmp_path):
     (tmp_path / "decay.py").write_text(UNUSED)
     command = ("--simulation", f"{tmp_path / 'decay.py'}:Decay", "--output", tmp_path / "out", "--surrogates", 19)
     result = mkc("diagnose", decay_table(tmp_path / "run.csv", zero=True), *command)

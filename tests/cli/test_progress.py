@@ -1,4 +1,4 @@
-"""A run shows on a terminal what it does and for how long, with forked copies, and little or nothing in a pipe."""
+"""Progress on a terminal, with worker processes, in a pipe and in a file."""
 
 import os
 import re
@@ -22,7 +22,7 @@ posix = pytest.mark.skipif(os.name == "nt", reason="there are no pseudo-terminal
 
 
 def on_a_terminal(*arguments):
-    """Exit code and what a terminal of 100 columns was sent."""
+    """Return the exit code, and the output to a terminal of 100 columns."""
     ours, theirs = os.openpty()
     environment = {name: value for name, value in os.environ.items() if name not in ("NO_COLOR", "CI")}
     environment |= {"TERM": "xterm-256color", "COLUMNS": "100", "PYTHONIOENCODING": "utf-8"}
@@ -44,7 +44,7 @@ def on_a_terminal(*arguments):
 
 @pytest.mark.process
 @posix
-def test_one_recording_has_its_name_and_the_time(tmp_path):
+def test_the_progress_of_a_recording_has_its_name_and_the_time(tmp_path):
     path = table(tmp_path / "good.csv", noisy_ellipsoid(3000), time=torch.arange(3000) / 50.0)
     code, seen = on_a_terminal("calibrate", path, "--output", tmp_path / "out")
     assert code == 0
@@ -57,7 +57,7 @@ def test_one_recording_has_its_name_and_the_time(tmp_path):
 
 @pytest.mark.process
 @posix
-def test_experiments_are_counted_while_copies_work(tmp_path):
+def test_runs_are_counted_while_worker_processes_are_busy(tmp_path):
     count = 300
     points = noisy_ellipsoid(2 * count)
     time, run = torch.arange(2 * count) % count / 20.0, torch.arange(2 * count) // count
@@ -78,7 +78,7 @@ def test_experiments_are_counted_while_copies_work(tmp_path):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="nothing is forked")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_nothing_is_forked_while_something_is_drawn():
+def test_no_process_is_forked_during_drawing():
     begun, done = threading.Event(), threading.Event()
 
     def draw():
@@ -98,7 +98,7 @@ def test_nothing_is_forked_while_something_is_drawn():
     thread.join()
 
 
-def test_long_work_adds_a_line_on_what_it_does_to_a_file(tmp_path, monkeypatch):
+def test_long_work_appends_its_stage_to_a_file(tmp_path, monkeypatch):
     monkeypatch.setattr(console, "_FILE_LINE_S", 0.02)
     folder = tmp_path / "not yet there"
     with progress(3, folder) as step:
@@ -116,7 +116,7 @@ def test_long_work_adds_a_line_on_what_it_does_to_a_file(tmp_path, monkeypatch):
         assert wait_for(folder / "progress.txt", len(lines) + 1)[-1].endswith("min: calibrating c.csv")
 
 
-def test_in_a_pipe_calibrate_writes_its_stage_from_time_to_time(capfd, monkeypatch):
+def test_calibrate_writes_its_stage_periodically_to_a_pipe(capfd, monkeypatch):
     monkeypatch.setattr(console, "_FIRST_LINE_S", 0.02)
     monkeypatch.setattr(console, "_LINE_S", 0.02)
     with progress(2, lines=True) as step:
@@ -131,7 +131,7 @@ def test_in_a_pipe_calibrate_writes_its_stage_from_time_to_time(capfd, monkeypat
     assert re.fullmatch(f"({line}){{2,}}", seen)
 
 
-def test_in_a_pipe_nothing_is_written_without_lines(capfd, monkeypatch):
+def test_progress_without_lines_writes_nothing_to_a_pipe(capfd, monkeypatch):
     monkeypatch.setattr(console, "_FIRST_LINE_S", 0.02)
     monkeypatch.setattr(console, "_LINE_S", 0.02)
     with progress(2) as step:
@@ -141,7 +141,7 @@ def test_in_a_pipe_nothing_is_written_without_lines(capfd, monkeypatch):
 
 
 def wait_for(file, lines):
-    """The lines of a file once it has so many."""
+    """Return the lines of a file once it has so many."""
     for _ in range(500):
         found = file.read_text().splitlines() if file.exists() else []
         if len(found) >= lines:
@@ -150,7 +150,7 @@ def wait_for(file, lines):
     raise AssertionError(found)
 
 
-def test_short_work_and_a_folder_that_cannot_be_written_leave_no_file(tmp_path, monkeypatch):
+def test_short_work_and_unwritable_folders_leave_no_progress_file(tmp_path, monkeypatch):
     with progress(1, tmp_path / "short") as step:
         step("calibrating a.csv")
     assert not (tmp_path / "short").exists()

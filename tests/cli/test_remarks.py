@@ -23,7 +23,7 @@ def printed(work):
 
 @pytest.fixture(scope="module")
 def disturbed():
-    """The calibration of a turning sensor that a magnet approaches for three seconds."""
+    """Return the calibration of a turning sensor that a magnet approaches for three seconds."""
     recording, _ = simulated_recording()
     field, time = recording.magnetometer().clone(), recording.time
     near = (time >= 48.8) & (time <= 51.8)
@@ -51,7 +51,7 @@ def test_notes_fill_five_lines_at_most():
     assert len(rows) == 5
 
 
-def test_several_sensors_fit_on_a_page_with_their_results_first(disturbed):
+def test_the_summary_of_three_sensors_is_short_and_starts_with_their_results(disturbed):
     results = [SensorResult(name, disturbed, [], ()) for name in ("mag0", "mag1", "mag2")]
     lines = printed(lambda console: show_sensors(console, "log", results)).strip().splitlines()
     assert lines[0] == "log: 3 magnetometers"

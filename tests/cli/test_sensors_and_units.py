@@ -1,4 +1,4 @@
-"""Several magnetometers in a file, units that are asked for, and what a file holds."""
+"""Several magnetometers in a file, units, and `mkc inspect`."""
 
 import json
 import shlex
@@ -9,25 +9,15 @@ import torch
 pytest.importorskip("typer")
 pytest.importorskip("polars")
 
-from typer.testing import CliRunner
 
 from mkc_torch.calibration.calibrate import Calibration
-from mkc_torch.cli.app import app
 from mkc_torch.cli.diagnose import _sensor, _units
 from mkc_torch.cli.units_option import parsed_units
 from mkc_torch.recording.recording import Recording, write_table
 from tests.calibration.test_calibrate import noisy_ellipsoid
-from tests.cli.test_cli import refused
+from tests.cli.commands import assert_refused, flat, mkc
 
 COUNT = 300
-
-
-def mkc(*arguments):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
-
-
-def flat(text):
-    return " ".join(text.split())
 
 
 def calibration(folder):
@@ -36,7 +26,7 @@ def calibration(folder):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A table with two magnetometers, and one with one in nT by its names, both calibrated."""
+    """Return a folder with calibrated tables: of two magnetometers, and of one in nT by its column names."""
     place = tmp_path_factory.mktemp("sensors")
     points, time = noisy_ellipsoid(COUNT), torch.arange(COUNT) / 50.0
     columns = {f"mag0_{a}": points[:, k] for k, a in enumerate("xyz")}
@@ -59,11 +49,13 @@ def test_each_sensor_has_a_calibration_in_a_folder_of_its_name(folder):
 
 
 def test_results_of_several_sensors_are_kept(folder):
-    refused(mkc("calibrate", folder / "two.csv", "--output", folder / "out"), "two exists and is not empty", "--force")
+    assert_refused(
+        mkc("calibrate", folder / "two.csv", "--output", folder / "out"), "two exists and is not empty", "--force"
+    )
 
 
 @pytest.mark.e2e
-def test_one_sensor_that_fails_does_not_keep_the_others(folder, tmp_path):
+def test_a_failed_sensor_does_not_stop_the_others(folder, tmp_path):
     table = Recording.read(folder / "two.csv", recognise=False)
     flat_one = dict(table.columns) | {f"mag1_{axis}": torch.full((COUNT,), 20.0) for axis in "xyz"}
     write_table(tmp_path / "a.csv", flat_one)
@@ -75,17 +67,19 @@ def test_one_sensor_that_fails_does_not_keep_the_others(folder, tmp_path):
 
 
 @pytest.mark.e2e
-def test_one_of_several_can_be_chosen(folder, tmp_path):
+def test_a_single_sensor_can_be_selected(folder, tmp_path):
     result = mkc("calibrate", folder / "two.csv", "--output", tmp_path, "--sensor", "mag1")
     assert result.exit_code == 0, result.output
     assert calibration(tmp_path / "two").center == calibration(folder / "out" / "two" / "mag1").center
-    refused(mkc("calibrate", folder / "two.csv", "--output", tmp_path / "o", "--sensor", "mag5"), "`mag0`, `mag1`")
+    assert_refused(
+        mkc("calibrate", folder / "two.csv", "--output", tmp_path / "o", "--sensor", "mag5"), "`mag0`, `mag1`"
+    )
 
 
-def test_apply_takes_the_sensor_and_needs_its_name(folder, tmp_path):
+def test_apply_requires_the_sensor_of_a_file_with_several(folder, tmp_path):
     model = folder / "out" / "two" / "mag1" / "calibration.json"
     command = ("apply", model, folder / "two.csv", "--output", tmp_path / "o.csv")
-    refused(mkc(*command), "2 magnetometers, `mag0`, `mag1`", "--sensor mag0")
+    assert_refused(mkc(*command), "2 magnetometers, `mag0`, `mag1`", "--sensor mag0")
     assert mkc(*command, "--sensor", "mag1").exit_code == 0
     written = Recording.read(tmp_path / "o.csv", recognise=False)
     measured = Recording.read(folder / "two.csv", sensor="mag1").magnetometer()
@@ -94,8 +88,8 @@ def test_apply_takes_the_sensor_and_needs_its_name(folder, tmp_path):
     assert written.names[:7] == ("time", *(f"mag{n}_{axis}" for n in "01" for axis in "xyz"))
 
 
-def test_apply_converts_as_calibrate_did(folder, tmp_path):
-    """The same samples in nT by their names, and in gauss by the option, have one corrected field."""
+def test_apply_converts_units_as_calibrate_does(folder, tmp_path):
+    """The same samples in nT by their names, and in gauss by the option, have the same corrected field."""
     model = folder / "out" / "one" / "calibration.json"
     assert calibration(model.parent).unit == "µT"
     named = ("apply", model, folder / "one.csv", "--output", tmp_path / "a.csv")
@@ -112,20 +106,20 @@ def test_apply_converts_as_calibrate_did(folder, tmp_path):
 def test_apply_reports_different_units(folder, tmp_path):
     model = folder / "out" / "one" / "calibration.json"
     command = ("apply", model, folder / "one.csv", "--output", tmp_path / "a.csv", "--unit-label", "counts")
-    refused(mkc(*command), "is in counts, but the calibrated recording was in µT")
+    assert_refused(mkc(*command), "is in counts, but the calibrated recording was in µT")
     result = mkc("apply", model, folder / "gauss.csv", "--output", tmp_path / "b.csv")
     assert "check the unit" in flat(result.stdout)
 
 
 @pytest.mark.parametrize("texts", [["mag=gauss,time=ms"], ["mag=gauss", "time=ms"], ["mag=gauss time=ms"]])
-def test_units_are_written_in_one_option_or_in_several(texts):
+def test_units_can_be_given_in_a_single_option_or_in_several(texts):
     assert parsed_units(texts) == {"mag": "gauss", "time": "ms"}
 
 
 @pytest.mark.e2e
-def test_guessed_units_are_refused_and_given_units_converted(folder, tmp_path):
+def test_a_probable_unit_is_refused_and_a_given_unit_is_converted(folder, tmp_path):
     path = folder / "gauss.csv"
-    refused(mkc("calibrate", path, "--output", tmp_path / "no"), "in gauss", "`--convert mag=gauss`")
+    assert_refused(mkc("calibrate", path, "--output", tmp_path / "no"), "in gauss", "`--convert mag=gauss`")
     assert not (tmp_path / "no" / "gauss").exists()
     result = mkc("calibrate", path, "--output", tmp_path / "out", "--convert", "mag=gauss", "time=ms")
     assert result.exit_code == 0, result.output
@@ -146,11 +140,11 @@ def test_guessed_units_are_refused_and_given_units_converted(folder, tmp_path):
         (("--sensor", "mag0", "--quantity", "accel"), "leave it out with --quantity accel"),
     ],
 )
-def test_units_that_cannot_be_understood(folder, tmp_path, arguments, words):
-    refused(mkc("calibrate", folder / "one.csv", "--output", tmp_path / "o", *arguments), words, code=2)
+def test_invalid_units_are_refused_with_the_remedy(folder, tmp_path, arguments, words):
+    assert_refused(mkc("calibrate", folder / "one.csv", "--output", tmp_path / "o", *arguments), words, code=2)
 
 
-def test_the_users_simulation_declares_its_own_units():
+def test_unit_and_sensor_options_are_refused_with_a_simulation_of_the_user():
     from typer import BadParameter
 
     assert _units(["time=us"], None, "pendulum.py:Pendulum") == {"time": "us"}

@@ -1,4 +1,4 @@
-"""The command line answers what needs no computing without loading what computes."""
+"""Help, version and usage errors load no heavy dependency such as torch."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ from mkc_torch.diagnosis.pipeline import prepare
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.recording.recording import write_table
 
-REFUSING = """
+WITHOUT_HEAVY_IMPORTS = """
 import sys
 
 class Refusing:
@@ -29,35 +29,39 @@ cli.main()
 """
 
 
-def answered(*arguments):
+def run_without_heavy_imports(*arguments):
     return subprocess.run(
-        [sys.executable, "-c", REFUSING, *arguments], capture_output=True, text=True, check=False, timeout=60
+        [sys.executable, "-c", WITHOUT_HEAVY_IMPORTS, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
     )
 
 
 @pytest.mark.parametrize("command", [(), ("diagnose",), ("calibrate",), ("apply",), ("demo",)])
-def test_help_comes_without_what_computes(command):
-    done = answered(*command, "--help")
+def test_help_loads_no_heavy_dependency(command):
+    done = run_without_heavy_imports(*command, "--help")
     assert (done.returncode, done.stderr) == (0, "")
     assert " ".join(("Usage: mkc", *command)) in done.stdout
 
 
-def test_so_does_the_version():
-    done = answered("--version")
+def test_the_version_loads_no_heavy_dependency():
+    done = run_without_heavy_imports("--version")
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("mkc ")
 
 
 @pytest.mark.parametrize("mistake", [("nonsense",), ("calibrate", "--nonsense"), ("demo", "--outptu", "there")])
-def test_so_do_mistakes(mistake):
-    done = answered(*mistake)
+def test_usage_errors_load_no_heavy_dependency(mistake):
+    done = run_without_heavy_imports(*mistake)
     assert done.returncode == 2
     assert "Usage: mkc" in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_work_does_need_them(tmp_path):
-    done = answered("demo", "--output", str(tmp_path / "demo"))
+def test_a_command_loads_heavy_dependencies(tmp_path):
+    done = run_without_heavy_imports("demo", "--output", str(tmp_path / "demo"))
     assert "was loaded" in done.stderr
 
 
@@ -74,7 +78,7 @@ def test_a_calibration_loads_no_compiler(tmp_path):
     assert done.stdout.endswith("loaded []\n"), done.stdout + done.stderr
 
 
-def test_what_the_command_line_knows_of_a_diagnosis_is_true():
+def test_defaults_of_the_command_line_equal_those_of_diagnose():
     module = sys.modules["mkc_torch.diagnosis.diagnose"]
     assert (diagnosis_request.LEVEL, diagnosis_request.SURROGATES) == (module.LEVEL, module.SURROGATES)
     assert diagnosis_request.INPUT_HOLDS == prepare.BETWEEN

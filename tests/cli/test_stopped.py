@@ -1,4 +1,4 @@
-"""`mkc diagnose` that is stopped, by a time limit or by Ctrl-C, writes what is known, and leaves no process behind."""
+"""`mkc diagnose` stopped by a time limit or Ctrl-C writes partial results and leaves no process running."""
 
 import io
 import json
@@ -20,8 +20,8 @@ from mkc_torch.cli.console import progress
 from mkc_torch.diagnosis.io.diagnosis_json import validate
 from mkc_torch.diagnosis.pipeline.partial import PartialResult
 from mkc_torch.diagnosis.result import Stop
-from tests.cli.test_cli import mkc
-from tests.cli.test_diagnose import STEPPED, quiet, refused, sensor
+from tests.cli.commands import assert_refused, mkc
+from tests.cli.test_diagnose import STEPPED, quiet_table, sensor_columns
 from tests.diagnosis.factory import make_diagnosis
 from tests.started import started
 
@@ -31,7 +31,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked el
 
 
 def stopped_in_the_search(monkeypatch, reason="time limit"):
-    """The first diagnosis stops once its search has begun."""
+    """Stop the first diagnosis once its search has started."""
     waiting = []
     keep = PartialResult.keep_search
 
@@ -56,8 +56,8 @@ def search_of(folder):
 
 
 @pytest.mark.e2e
-def test_a_time_limit_writes_what_is_known_and_exits_with_3(tmp_path, monkeypatch):
-    path = quiet(tmp_path / "a.csv")
+def test_a_time_limit_writes_partial_results_and_exits_with_3(tmp_path, monkeypatch):
+    path = quiet_table(tmp_path / "a.csv")
     stopped_in_the_search(monkeypatch)
     result = mkc("diagnose", path, *ON_A_MAGNETOMETER, "--output", tmp_path / "out", "--time-limit", "3600")
     assert (result.exit_code, result.stderr) == (3, "")
@@ -67,16 +67,16 @@ def test_a_time_limit_writes_what_is_known_and_exits_with_3(tmp_path, monkeypatc
 
 @pytest.mark.e2e
 def test_a_time_limit_before_the_first_fit_writes_nothing_and_exits_with_1(tmp_path):
-    path = quiet(tmp_path / "a.csv")
+    path = quiet_table(tmp_path / "a.csv")
     result = mkc("diagnose", path, *ON_A_MAGNETOMETER, "--output", tmp_path / "out", "--time-limit", "1e-6")
-    refused(result, f"mkc: {path}: the time limit of 1e-06 s was over before the simulation's first fit")
+    assert_refused(result, f"mkc: {path}: the time limit of 1e-06 s was over before the simulation's first fit")
     assert not (tmp_path / "out" / "a").exists()
 
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("how", [("--together",), ("--simulator-output",)])
-def test_recordings_together_and_a_simulated_table_are_stopped_alike(tmp_path, monkeypatch, how):
-    paths = [quiet(tmp_path / "a.csv"), quiet(tmp_path / "b.csv", **sensor(STEPPED))]
+def test_a_time_limit_stops_joint_diagnoses_and_those_of_simulator_outputs(tmp_path, monkeypatch, how):
+    paths = [quiet_table(tmp_path / "a.csv"), quiet_table(tmp_path / "b.csv", **sensor_columns(STEPPED))]
     stopped_in_the_search(monkeypatch)
     limit = ("--output", tmp_path / "out", "--time-limit", "3600", "--surrogates", "19")
     if how == ("--together",):
@@ -90,7 +90,7 @@ def test_recordings_together_and_a_simulated_table_are_stopped_alike(tmp_path, m
 @pytest.mark.e2e
 def test_an_interrupt_writes_and_reports_the_results_so_far_and_stops(tmp_path, monkeypatch):
     path = tmp_path / "runs.csv"
-    quiet(path)
+    quiet_table(path)
     lines = path.read_text().splitlines()
     runs = [f"{line},{run}" for run in (1, 2) for line in lines[1:]]
     path.write_text("\n".join([f"{lines[0]},experiment", *runs]) + "\n")
@@ -102,7 +102,7 @@ def test_an_interrupt_writes_and_reports_the_results_so_far_and_stops(tmp_path, 
     assert not (tmp_path / "out" / "runs" / "2").exists()
 
 
-def test_a_quick_look_and_a_limit_are_passed_on(tmp_path, monkeypatch):
+def test_quick_and_time_limit_are_passed_to_diagnose_and_reported(tmp_path, monkeypatch):
     seen = {}
     limited = {
         "p_value": None,
@@ -116,7 +116,7 @@ def test_a_quick_look_and_a_limit_are_passed_on(tmp_path, monkeypatch):
         return make_diagnosis(0, model=None, **limited)
 
     monkeypatch.setattr(diagnosis_files, "diagnose", diagnose)
-    path = quiet(tmp_path / "a.csv")
+    path = quiet_table(tmp_path / "a.csv")
     options = ("--quick", "--time-limit", "8", "--output", tmp_path / "out")
     result = mkc("diagnose", path, "--simulation", "magnetometer", *options)
     assert result.exit_code == 3, result.output
@@ -129,13 +129,15 @@ def test_a_quick_look_and_a_limit_are_passed_on(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("limit", ["0", "-1", "nan", "inf"])
-def test_a_limit_is_above_0(tmp_path, limit):
+def test_a_time_limit_of_0_or_less_is_refused(tmp_path, limit):
     result = mkc("diagnose", "a.csv", "--output", tmp_path, "--time-limit", limit)
-    refused(result, "--time-limit must be a number of seconds above 0", code=2)
+    assert_refused(result, "--time-limit must be a number of seconds above 0", code=2)
 
 
-def test_a_quick_look_has_no_surrogates(tmp_path):
-    refused(mkc("diagnose", "a.csv", "--output", tmp_path, "--quick", "--surrogates", "99"), "--quick draws no", code=2)
+def test_quick_with_surrogates_is_refused(tmp_path):
+    assert_refused(
+        mkc("diagnose", "a.csv", "--output", tmp_path, "--quick", "--surrogates", "99"), "--quick draws no", code=2
+    )
 
 
 WAITING = """
@@ -165,7 +167,7 @@ main()
 @linux
 def test_ctrl_c_ends_all_processes_and_its_files_are_whole(tmp_path):
     """The process waits in its search until it is interrupted."""
-    path, begun, out = quiet(tmp_path / "a.csv"), tmp_path / "begun", tmp_path / "out"
+    path, begun, out = quiet_table(tmp_path / "a.csv"), tmp_path / "begun", tmp_path / "out"
     code = tmp_path / "waiting.py"
     code.write_text(WAITING)
     with started(code, "diagnose", path, *ON_A_MAGNETOMETER, "--output", out, begun) as process:
@@ -181,7 +183,7 @@ def test_ctrl_c_ends_all_processes_and_its_files_are_whole(tmp_path):
     assert search_of(out / "a")["stopped"]["reason"] == "interrupt"
 
 
-def test_how_much_of_a_stage_is_done_is_shown_with_the_time_it_takes(monkeypatch):
+def test_progress_within_a_stage_is_shown_with_its_duration(monkeypatch):
     shown, clock = io.StringIO(), [0.0]
     monkeypatch.setattr(console, "err", lambda: console._console(True, width=120, file=shown))
     with progress(1) as step:
@@ -206,7 +208,7 @@ def test_how_much_of_a_stage_is_done_is_shown_with_the_time_it_takes(monkeypatch
         assert step.part_done == ""
 
 
-def test_in_a_pipe_nothing_is_shown_but_the_file_of_long_work_has_it(tmp_path, capsys):
+def test_progress_within_a_stage_is_in_the_file_and_not_in_a_pipe(tmp_path, capsys):
     with progress(1) as step:
         step("diagnosing a.csv: trying 91 effects")
         step.part("candidate", 30, 91)

@@ -1,4 +1,4 @@
-"""Every write of every command, killed or on a full disk: a file is whole or not there, and nothing is lost."""
+"""Every write of every command, killed or on a full disk: files are complete or absent, and none is lost."""
 
 import json
 import os
@@ -13,12 +13,11 @@ pytest.importorskip("typer")
 pytest.importorskip("polars")
 
 import torch
-from typer.testing import CliRunner
 
 from mkc_torch.cli import diagnosis_files
-from mkc_torch.cli.app import app
 from mkc_torch.recording.recording import write_table
 from tests.calibration.test_calibrate import noisy_ellipsoid
+from tests.cli.commands import mkc
 from tests.diagnosis.factory import make_diagnosis
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no fork")
@@ -26,10 +25,6 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no fork")
 ROOT = Path(__file__).resolve().parents[2]
 AXES = ("mag_x", "mag_y", "mag_z")
 ENDS = {".json": "}\n", ".html": "</html>", ".py": "\n", ".csv": "\n"}
-
-
-def mkc(*arguments):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
 
 
 @pytest.fixture
@@ -42,7 +37,7 @@ def recording(tmp_path):
 
 @pytest.fixture
 def commands(recording, tmp_path, monkeypatch):
-    """Each command that writes, and how many files it writes."""
+    """Return each command that writes, and the number of its files."""
     assert mkc("calibrate", recording, "--output", tmp_path / "before").exit_code == 0
     monkeypatch.setattr(diagnosis_files, "diagnose", lambda *_, **__: make_diagnosis())
     return {
@@ -93,7 +88,7 @@ for number in numbers:
 
 
 def in_children(kind, numbers, command):
-    """Runs of a command in processes of their own: their exit statuses, negative where a signal ended one."""
+    """Run a command in child processes; return their exit statuses, negative if ended by a signal."""
     given = json.dumps([kind, numbers, [str(part) for part in command]])
     with subprocess.Popen(
         [sys.executable, "-c", IN_CHILDREN, given],
@@ -109,14 +104,14 @@ def in_children(kind, numbers, command):
 
 
 def written(folder: Path):
-    """Files by name, without those that a killed process left half-written."""
+    """Return the files by name, without the temporary files of a killed process."""
     paths = [folder] if folder.is_file() else sorted(folder.rglob("*")) if folder.exists() else []
     return {path.name: path.read_text() for path in paths if path.is_file() and path.suffix != ".tmp"}
 
 
 @pytest.mark.process
 @pytest.mark.parametrize("name", ["calibrate", pytest.param("apply", marks=pytest.mark.slow), "diagnose"])
-def test_killed_at_any_write_leaves_whole_files_alone_and_the_next_run_works(commands, name):
+def test_a_command_killed_at_any_write_leaves_only_complete_files_and_can_be_repeated(commands, name):
     command, files = commands[name]
     place = command[-1]
     for number, status in in_children("killed", list(range(1, files + 1)), (*command, "--force")):
@@ -135,8 +130,8 @@ def test_killed_at_any_write_leaves_whole_files_alone_and_the_next_run_works(com
 @pytest.mark.parametrize(
     "name", ["calibrate", *(pytest.param(name, marks=pytest.mark.slow) for name in ("apply", "diagnose"))]
 )
-def test_a_full_disk_is_reported_and_loses_nothing(commands, name):
-    """A limit on the size of files is the nearest to a full disk that needs no disk."""
+def test_a_full_disk_is_reported_and_keeps_existing_files(commands, name):
+    """A limit on the size of files stands for a full disk."""
     command, files = commands[name]
     place = command[-1]
     assert mkc(*command).exit_code == 0

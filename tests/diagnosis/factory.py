@@ -39,7 +39,7 @@ CATALOGUE = (
 
 
 def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candidates=12, **changes):
-    """A diagnosis of a simulated magnetometer; any field can be replaced by name, and advice follows from the rest.
+    """Return a diagnosis of a simulated magnetometer; fields can be replaced by name, and advice follows from the rest.
 
     So can the smooth correction: what it reaches is the ``ceiling``, None for none, along columns that are
     ``remaining``.
@@ -96,7 +96,7 @@ def with_evidence(thing, *results):
     return graded(changed) if isinstance(changed, Finding) else changed
 
 
-def make_follows(output="angle", unit="rad", residual=0.0049, variation=0.35, floor=0.005, **changes):
+def make_goodness_of_fit(output="angle", unit="rad", residual=0.0049, variation=0.35, floor=0.005, **changes):
     """Return the goodness of fit of an output."""
     made = GoodnessOfFit(
         output, unit, residual, variation, 1.0 - (residual / variation) ** 2, floor, "declared", variation, 0.021
@@ -104,7 +104,7 @@ def make_follows(output="angle", unit="rad", residual=0.0049, variation=0.35, fl
     return dataclasses.replace(made, **changes)
 
 
-LOST = (make_follows(residual=0.36, explained=0.12), make_follows("rate", "rad/s", 1.9, 1.4, 0.02))
+POOR_FITS = (make_goodness_of_fit(residual=0.36, explained=0.12), make_goodness_of_fit("rate", "rad/s", 1.9, 1.4, 0.02))
 """Two outputs with a poor fit."""
 
 PROCESS_NOISE = ProcessNoise(
@@ -118,7 +118,7 @@ PROCESS_NOISE = ProcessNoise(
 )
 
 
-def make_forcing(samples=1800, noise=PROCESS_NOISE):
+def make_disturbance(samples=1800, noise=PROCESS_NOISE):
     """Return the estimated disturbance of a pendulum's rate."""
     time = torch.arange(samples, dtype=torch.float64) / 20.0
     value = noise.size * (torch.sin(1.1 * time) + 0.6 * torch.sin(3.7 * time + 1.0))
@@ -138,10 +138,10 @@ def make_forcing(samples=1800, noise=PROCESS_NOISE):
 def make_environment(**changes):
     """Return the environment of a pendulum with a good fit, a disturbed rate, and a held torque."""
     environment = NoiseEnvironment(
-        goodness_of_fit=(make_follows(),),
+        goodness_of_fit=(make_goodness_of_fit(),),
         process_noise=(PROCESS_NOISE,),
         input_hold={"torque": "held"},
-        disturbance=(make_forcing(),),
+        disturbance=(make_disturbance(),),
         starts=12,
     )
     return dataclasses.replace(environment, **changes)
@@ -153,14 +153,14 @@ def make_unfit(**changes):
         "Another start reaches 0.006 rad: `gravity` = −9.81 with the other sign.",
         "`damping` ends at its bound, 0.",
     )
-    environment = NoiseEnvironment(goodness_of_fit=LOST, reasons=reasons, starts=12)
+    environment = NoiseEnvironment(goodness_of_fit=POOR_FITS, reasons=reasons, starts=12)
     return make_diagnosis(
         0, **{"simulation": "Pendulum", "samples": 400, "verdict": "unfit", "environment": environment} | changes
     )
 
 
-def nearest(finding, gain=163.0, formula="0.0071 |x|^1.52 sign(x)", curve=None):
-    """A finding whose name's shape is not the recording's."""
+def with_another_shape(finding, gain=163.0, formula="0.0071 |x|^1.52 sign(x)", curve=None):
+    """Return a finding of another shape than the recording's."""
     shape = ShapeCheck(gain, 0.002, curve or finding.curve, formula)
     return dataclasses.replace(finding, grade="nearest", shape=shape)
 

@@ -9,7 +9,7 @@ from mkc_torch.simulation.protocol import ClosedForm
 
 
 class Line(ClosedForm):
-    """``y = θ₀ + θ₁ t`` in both channels; what enters at "mixed" is seen through ``mixing``, at "summed" as its sum."""
+    """``y = θ₀ + θ₁ t`` in both channels; ``mixing`` multiplies a change at "mixed", a change at "summed" is summed."""
 
     name = "line"
     channels = ("left", "right")

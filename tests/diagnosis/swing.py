@@ -52,7 +52,7 @@ def walk(random, n, samples):
 
 
 @functools.cache
-def swung(disturbance="none", seed=0, N=500, drag=0.0, effect=1.0, late=0):
+def pendulum_recording(disturbance="none", seed=0, N=500, drag=0.0, effect=1.0, late=0):
     """Return a recording and the disturbance of its rate; the disturbance is "none", "white", "slow" or "torque".
 
     Args:
@@ -99,15 +99,15 @@ def fitted_under_noise(recording, system=Pendulum):
 
 
 @functools.cache
-def fitted_swing(disturbance="none", seed=0, N=500, drag=0.0):
-    """Fit a recording of :func:`swung`."""
-    return fitted_under_noise(swung(disturbance, seed, N, drag)[0])
+def fitted_pendulum(disturbance="none", seed=0, N=500, drag=0.0):
+    """Fit a recording of :func:`pendulum_recording`."""
+    return fitted_under_noise(pendulum_recording(disturbance, seed, N, drag)[0])
 
 
 @functools.cache
-def at_the_truth(disturbance="white", seed=0):
-    """Return a pendulum of :func:`swung` at its true parameters, under the drawn disturbance."""
-    prepared = Pendulum().prepare(swung(disturbance, seed)[0])
+def pendulum_at_truth(disturbance="white", seed=0):
+    """Return a pendulum of :func:`pendulum_recording` at its true parameters, under the drawn disturbance."""
+    prepared = Pendulum().prepare(pendulum_recording(disturbance, seed)[0])
     theta = torch.tensor([9.0, 0.15, 0.3, 0.0], dtype=torch.float64)
     prepared = prepared.observed(strong_observer(prepared, theta, 10.0))
     flow = flow_of(prepared, theta, {}, None)

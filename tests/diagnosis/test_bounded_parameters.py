@@ -1,4 +1,4 @@
-"""A parameter with narrow limits does not stand for missing physics."""
+"""A parameter with narrow bounds does not absorb missing physics."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ class Rocket(Dynamics):
 
 
 def flight(drag, seed, hertz=10, seconds=16, slow=2.0):
-    """A flight with a barometer that errs slowly, for 1 s at a time."""
+    """Return a recording of a flight whose barometer has a slow error with a correlation time of 1 s."""
     random = np.random.default_rng(seed)
     altitude, speed, error, path = 300.0, 190.0, slow * random.normal(), []
     kept = np.exp(-1.0 / hertz)

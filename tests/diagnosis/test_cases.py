@@ -13,7 +13,7 @@ from mkc_torch import Recording, diagnose
 from mkc_torch.simulation import load_simulation
 from tests.shared_data import shared_case, shared_real
 
-AS_WRITTEN, CONFIRMED = "left_out", ("left_out", "small")
+LEFT_OUT, CONFIRMED = "left_out", ("left_out", "small")
 INPUT, DRAG = "torque", ("linear_drag", "quadratic_drag", "power_law")
 
 slow = pytest.mark.slow
@@ -33,7 +33,7 @@ def pendulum(name, between=None):
     return diagnosed(f"simulated/{name}/run.csv", "simulated/naive.py:Pendulum", between)
 
 
-def first(diagnosis, effect, channel):
+def first_finding(diagnosis, effect, channel):
     """Return the first finding, which has to be this effect."""
     found = diagnosis.findings[0]
     assert (found.effect, found.channels) == (effect, (channel,))
@@ -116,7 +116,7 @@ def test_an_output_unrelated_to_the_input_is_unfit():
 def test_a_coasting_car_has_drag():
     diagnosis = diagnosed("coastdown/runs.csv", "coastdown/naive.py:Coast")
     assert diagnosis.verdict in ("explained", "unexplained")
-    found = first(diagnosis, diagnosis.findings[0].effect, "rate of speed")
+    found = first_finding(diagnosis, diagnosis.findings[0].effect, "rate of speed")
     named = {found.effect, *(rival.effect for rival in found.alternatives if not rival.separable)}
     assert "quadratic_drag" in named
     assert found.effect in DRAG
@@ -131,7 +131,7 @@ def test_a_coasting_car_has_drag():
 def test_natural_convection_is_a_power_law_and_not_radiation():
     diagnosis = diagnosed("heater/runs.csv", "heater/naive.py:Heater")
     assert diagnosis.verdict == "explained"
-    found = first(diagnosis, "power_law", "rate of temp")
+    found = first_finding(diagnosis, "power_law", "rate of temp")
     assert 1.4 < value(found, "exponent") < 1.6
     assert "thermal_loss" not in [finding.effect for finding in diagnosis.findings]
     assert "thermal_loss" not in [rival.effect for rival in found.alternatives if not rival.separable]
@@ -143,7 +143,7 @@ def test_natural_convection_is_a_power_law_and_not_radiation():
 @slow
 def test_ground_effect_is_a_curve_of_the_height():
     diagnosis = diagnosed("altitude/runs.csv", "altitude/naive.py:Altitude")
-    found = first(diagnosis, "unknown", "rate of climb")
+    found = first_finding(diagnosis, "unknown", "rate of climb")
     assert found.curve is not None
     assert found.curve.driver == "height"
     height = found.held_out.outputs["height"]
@@ -157,8 +157,8 @@ def test_ground_effect_is_a_curve_of_the_height():
 @slow
 def test_dry_friction_of_a_geared_motor_has_sizes_in_each_outputs_unit():
     diagnosis = diagnosed("gear_motor/runs.csv", "gear_motor/naive.py:GearMotor")
-    found = first(diagnosis, "stribeck_friction", "rate of speed")
-    assert found.grade == AS_WRITTEN
+    found = first_finding(diagnosis, "stribeck_friction", "rate of speed")
+    assert found.grade == LEFT_OUT
     sizes = found.held_out.outputs
     assert {name: size.unit for name, size in sizes.items()} == {"angle": "rad", "speed": "rad/s"}
     for size in sizes.values():
@@ -198,14 +198,14 @@ def test_two_tanks_have_a_good_fit():
 def test_a_load_on_a_flexible_shaft_is_a_hidden_mode(name):
     diagnosis = diagnosed(f"two_mass/{name}.csv", "two_mass/naive.py:Drive")
     assert diagnosis.verdict == "explained"
-    found = first(diagnosis, "hidden_mode", "rate of speed")
-    assert found.grade == AS_WRITTEN
+    found = first_finding(diagnosis, "hidden_mode", "rate of speed")
+    assert found.grade == LEFT_OUT
     assert value(found, "share") == pytest.approx(0.849, abs=0.02)
     assert value(found, "period") == pytest.approx(0.2231, abs=0.001)
 
 
 @functools.cache
-def real(recording, simulation, begin=0, end=None, step=1):
+def diagnosed_real(recording, simulation, begin=0, end=None, step=1):
     """Diagnose some rows of a real recording whose missing physics is known, cached."""
     path, (file, name) = shared_real(recording), simulation.split(":")
     whole = Recording.read(path)
@@ -215,10 +215,10 @@ def real(recording, simulation, begin=0, end=None, step=1):
 
 @pytest.mark.e2e
 def test_a_coasting_rocket_has_quadratic_drag():
-    diagnosis = real("rocket/juno.csv", "rocket/naive.py:Rocket")
+    diagnosis = diagnosed_real("rocket/juno.csv", "rocket/naive.py:Rocket")
     assert diagnosis.verdict == "explained"
-    found = first(diagnosis, "quadratic_drag", "rate of speed")
-    assert found.grade == AS_WRITTEN
+    found = first_finding(diagnosis, "quadratic_drag", "rate of speed")
+    assert found.grade == LEFT_OUT
     # by hand 9.2e-5 1/m
     assert value(found, "drag") == pytest.approx(9.2e-5, rel=0.15)
 
@@ -226,35 +226,35 @@ def test_a_coasting_rocket_has_quadratic_drag():
 @pytest.mark.e2e
 def test_the_size_of_drag_belongs_to_a_gravity_within_its_bounds():
     # the air thins with height, so gravity ends at its lower bound; without it the drag would be 1.2e-4 1/m
-    diagnosis = real("rocket/juno.csv", "rocket/naive.py:Rocket", begin=1, step=2)
-    assert value(first(diagnosis, "quadratic_drag", "rate of speed"), "drag") == pytest.approx(9.2e-5, rel=0.15)
+    diagnosis = diagnosed_real("rocket/juno.csv", "rocket/naive.py:Rocket", begin=1, step=2)
+    assert value(first_finding(diagnosis, "quadratic_drag", "rate of speed"), "drag") == pytest.approx(9.2e-5, rel=0.15)
 
 
 @slow
-def test_a_power_at_its_bound_gives_way_to_dry_friction():
-    diagnosis = real("pendulum_encoder/run.csv", "pendulum_encoder/naive.py:Pendulum", end=700)
-    found = first(diagnosis, "coulomb_friction", "rate of speed")
+def test_dry_friction_replaces_a_power_law_at_its_bound():
+    diagnosis = diagnosed_real("pendulum_encoder/run.csv", "pendulum_encoder/naive.py:Pendulum", end=700)
+    found = first_finding(diagnosis, "coulomb_friction", "rate of speed")
     assert value(found, "friction") == pytest.approx(0.206, rel=0.1)
 
 
 @pytest.mark.e2e
 def test_a_mug_loses_heat_by_a_high_power():
-    diagnosis = real("mug/run.csv", "mug/naive.py:Cooling")
+    diagnosis = diagnosed_real("mug/run.csv", "mug/naive.py:Cooling")
     assert diagnosis.verdict == "explained"
-    assert first(diagnosis, "power_law", "rate of temp").grade == AS_WRITTEN
+    assert first_finding(diagnosis, "power_law", "rate of temp").grade == LEFT_OUT
 
 
 @slow
 def test_a_house_has_a_second_thermal_mass():
-    diagnosis = real("house/house_2.csv", "house/naive.py:House")
-    assert first(diagnosis, "hidden_lag", "rate of indoor").grade == AS_WRITTEN
+    diagnosis = diagnosed_real("house/house_2.csv", "house/naive.py:House")
+    assert first_finding(diagnosis, "hidden_lag", "rate of indoor").grade == LEFT_OUT
 
 
 @slow
 def test_a_pendulum_on_a_shaft_has_dry_friction():
-    diagnosis = real("pendulum_encoder/run.csv", "pendulum_encoder/naive.py:Pendulum")
-    found = first(diagnosis, "coulomb_friction", "rate of speed")
-    assert found.grade == AS_WRITTEN
+    diagnosis = diagnosed_real("pendulum_encoder/run.csv", "pendulum_encoder/naive.py:Pendulum")
+    found = first_finding(diagnosis, "coulomb_friction", "rate of speed")
+    assert found.grade == LEFT_OUT
     # by hand 0.206 rad/s²
     assert value(found, "friction") == pytest.approx(0.206, rel=0.1)
     assert "quadratic_drag" in confirmed(diagnosis)

@@ -47,22 +47,22 @@ HIDDEN = {
 
 
 @pytest.fixture(scope="module", params=sorted(HIDDEN))
-def named(request):
+def named_diagnosis(request):
     effect, drivers, parameter, value = HIDDEN[request.param]
     return request.param, drivers, parameter, value, diagnose(Magnetometer(), recording_of(effect))
 
 
 @pytest.mark.e2e
-def test_a_hidden_effect_is_named_with_its_driver(named):
-    effect, drivers, _, _, diagnosis = named
+def test_a_hidden_effect_is_named_with_its_driver(named_diagnosis):
+    effect, drivers, _, _, diagnosis = named_diagnosis
     assert diagnosis.verdict == "explained"
     assert (diagnosis.findings[0].effect, diagnosis.findings[0].drivers) == (effect, drivers)
     assert diagnosis.findings[0].p_value <= 0.05
 
 
 @pytest.mark.e2e
-def test_its_size_is_within_its_errors(named):
-    _, _, name, value, diagnosis = named
+def test_the_size_of_a_named_effect_is_within_its_errors(named_diagnosis):
+    _, _, name, value, diagnosis = named_diagnosis
     (parameter,) = [p for p in diagnosis.findings[0].parameters if p.name == name]
     off = (np.array(parameter.value) - value) / np.array(parameter.standard_error)
     assert np.abs(off).max() < 4.0
@@ -70,23 +70,23 @@ def test_its_size_is_within_its_errors(named):
 
 
 @pytest.mark.e2e
-def test_the_fit_improves_on_held_out_blocks(named):
-    held = named[-1].findings[0].held_out
+def test_a_named_effect_improves_the_fit_on_held_out_blocks(named_diagnosis):
+    held = named_diagnosis[-1].findings[0].held_out
     assert held.confidence_interval[0] > 0.0
     assert held.rmse_after < held.rmse_before
 
 
 @pytest.mark.e2e
-def test_the_file_is_valid_and_contains_the_finding(named):
-    effect, *_, diagnosis = named
+def test_diagnosis_json_is_valid_and_contains_the_finding(named_diagnosis):
+    effect, *_, diagnosis = named_diagnosis
     content = json.loads(diagnosis_to_json(diagnosis))
     assert content["schema"] == "mkc-diagnosis/3"
     assert content["findings"][0]["effect"] == effect
 
 
 @pytest.mark.e2e
-def test_the_model_corrects_another_recording(named):
-    effect, *_, diagnosis = named
+def test_the_model_corrects_another_recording(named_diagnosis):
+    effect, *_, diagnosis = named_diagnosis
     model = DiagnosedModel.from_json(diagnosis.model.to_json())
     lasting = {"hard_iron_step": 4.0 * GAIN * np.ones((N, 1))}.get(effect, HIDDEN[effect][0])
     later = tumbling(N, noise=0.0, sensor=lasting, size=(0.9, 1.1, 1.2), **COLUMNS)
@@ -117,7 +117,7 @@ def test_the_same_seed_gives_the_same_diagnosis():
 
 
 @pytest.mark.e2e
-def test_a_time_offset_and_a_name_change_nothing():
+def test_findings_do_not_depend_on_a_time_offset_or_the_recording_name():
     recording = recording_of(HIDDEN["current_field"][0])
     moved = Recording({**recording.columns, "time": recording["time"] + 1000.0}, name="other", units=recording.units)
     a, b = diagnose(Magnetometer(), recording), diagnose(Magnetometer(), moved)
@@ -186,15 +186,15 @@ def test_arguments_out_of_range_raise(options, message):
         diagnose(Magnetometer(), recording_of(np.zeros((N, 3))), **options)
 
 
-class Lacking:
+class EffectOfAnotherClass:
     id = "lacking"
 
 
-class Nameless(GainEffect):
+class EffectWithoutId(GainEffect):
     """An effect without an id."""
 
 
-class Letters(HardIronStep):
+class EffectWithTextRoles(HardIronStep):
     roles = "temperature"
 
 
@@ -218,11 +218,11 @@ class Letters(HardIronStep):
         ({"effects": None}, r"`effects` to be a sequence of Effects but got None; .*\(\) for no effects"),
         ({"effects": (HardIronStep,)}, r"got the class HardIronStep; .*, HardIronStep\(\)"),
         (
-            {"effects": (Lacking(),)},
-            "got a Lacking; derive it from mkc_torch.effects.Effect",
+            {"effects": (EffectOfAnotherClass(),)},
+            "got an EffectOfAnotherClass; derive it from mkc_torch.effects.Effect",
         ),
-        ({"effects": (Nameless(),)}, "got a Nameless; give it an `id`"),
-        ({"effects": (Letters(),)}, r"its roles are names, \('temperature',\)"),
+        ({"effects": (EffectWithoutId(),)}, "got an EffectWithoutId; give it an `id`"),
+        ({"effects": (EffectWithTextRoles(),)}, r"its roles are names, \('temperature',\)"),
         ({"level": "a"}, r"`level` to be a number in \(0, 1\) but got 'a'"),
     ],
 )

@@ -38,7 +38,7 @@ def contaminated(values, size, seed):
     return values + size * (1.0 + 29.0 * bad) * random.standard_normal(values.shape)
 
 
-def swung(hidden, seed=0):
+def pendulum_recording(hidden, seed=0):
     """600 samples of a damped pendulum's angle, with hidden physics in its equation."""
     time = np.arange(600) * 0.02
 
@@ -56,7 +56,7 @@ def value(finding, name):
     return match.value, match.standard_error
 
 
-def explained(diagnosis, effect):
+def only_confirmed_finding(diagnosis, effect):
     """Return the only finding, with the expected name and confirmed by held-out blocks."""
     assert diagnosis.verdict == "explained"
     (finding,) = diagnosis.findings
@@ -71,8 +71,8 @@ def explained(diagnosis, effect):
 @pytest.mark.parametrize(("size", "seed"), [(0.2, 0), pytest.param(0.05, 2, marks=pytest.mark.slow)])
 def test_air_drag_is_named_and_sized(size, seed):
     """A body whose flow is laminar at small speeds."""
-    recording = swung(lambda _, v: -size * v * math.hypot(v, 0.1), seed)
-    finding = explained(diagnose(Pendulum(), recording, **QUICK), "quadratic_drag")
+    recording = pendulum_recording(lambda _, v: -size * v * math.hypot(v, 0.1), seed)
+    finding = only_confirmed_finding(diagnose(Pendulum(), recording, **QUICK), "quadratic_drag")
     drag, error = value(finding, "drag")
     assert drag == pytest.approx(size, abs=0.015)
     assert 0.0 < error < 0.01
@@ -83,8 +83,10 @@ def test_air_drag_is_named_and_sized(size, seed):
 @pytest.mark.slow
 def test_dry_friction_is_named_and_sized():
     """The jump is smoothed by another function than the catalogue's."""
-    diagnosis = diagnose(Pendulum(), swung(lambda _, v: -0.3 * 2.0 / math.pi * math.atan(v / 0.002)), **QUICK)
-    finding = explained(diagnosis, "coulomb_friction")
+    diagnosis = diagnose(
+        Pendulum(), pendulum_recording(lambda _, v: -0.3 * 2.0 / math.pi * math.atan(v / 0.002)), **QUICK
+    )
+    finding = only_confirmed_finding(diagnosis, "coulomb_friction")
     assert value(finding, "friction")[0] == pytest.approx(0.3, abs=0.03)
     assert finding.held_out.rmse_after == pytest.approx(NOISE, rel=0.25)
     assert finding.alternatives[0].effect == "stribeck_friction"
@@ -93,7 +95,7 @@ def test_dry_friction_is_named_and_sized():
 @pytest.mark.e2e
 @pytest.mark.parametrize("seed", [0, 1])
 def test_noise_alone_has_no_findings(seed):
-    diagnosis = diagnose(Pendulum(), swung(lambda _, __: 0.0, seed), **QUICK)
+    diagnosis = diagnose(Pendulum(), pendulum_recording(lambda _, __: 0.0, seed), **QUICK)
     assert diagnosis.verdict == "adequate"
     assert diagnosis.findings == ()
     assert diagnosis.corrected.rmse == pytest.approx(NOISE, rel=0.25)
@@ -115,7 +117,7 @@ class Tanks(Dynamics):
         return {"upper": p.inflow * u.pump - p.drain * x.upper, "lower": -p.drain * x.lower}
 
 
-def filled(leak, seed=0):
+def tanks_recording(leak, seed=0):
     """400 samples of two tanks with a pipe between them: the exact solution from sample to sample."""
     step, random = 0.1, np.random.default_rng(seed)
     pump = np.repeat(random.uniform(0.1, 0.9, 40), 10)
@@ -133,7 +135,7 @@ def filled(leak, seed=0):
 
 @pytest.mark.e2e
 def test_a_pipe_between_two_tanks_is_named_and_sized():
-    finding = explained(diagnose(Tanks(), filled(0.15), **QUICK), "coupling")
+    finding = only_confirmed_finding(diagnose(Tanks(), tanks_recording(0.15), **QUICK), "coupling")
     exchange, error = value(finding, "exchange")
     assert exchange == pytest.approx(0.15, abs=0.03)  # the outflow of one tank is the inflow of the other
     assert error < 0.03
@@ -142,18 +144,18 @@ def test_a_pipe_between_two_tanks_is_named_and_sized():
 
 @pytest.mark.e2e
 def test_two_tanks_apart_are_adequate():
-    assert diagnose(Tanks(), filled(0.0), **QUICK).verdict == "adequate"
+    assert diagnose(Tanks(), tanks_recording(0.0), **QUICK).verdict == "adequate"
 
 
 # effects with memory, and fluids; each with its nearest rivals
 
 
-def among(*names):
+def effects_named(*names):
     return tuple(effect for effect in DYNAMICS if effect.id in names)
 
 
-def measured(rate, first, time, noise, **columns):
-    """A recording of the first states of an equation with hidden physics, by names and tolerances."""
+def solved_recording(rate, first, time, noise, **columns):
+    """Return a recording of the first states of an equation with hidden physics, by names and tolerances."""
     exact = solve_ivp(rate, (0.0, time[-1]), first, t_eval=time, rtol=1e-8, atol=1e-9, max_step=0.02)
     known = {name: contaminated(exact.y[k], noise, k) for k, name in enumerate(columns.pop("seen"))}
     return Recording({name: torch.as_tensor(values) for name, values in {"time": time, **known, **columns}.items()})
@@ -172,7 +174,7 @@ class Servo(Dynamics):
         return {"angle": x.speed, "speed": p.stiffness * (u.command - x.angle) - p.damping * x.speed}
 
 
-def commanded(behind):
+def servo_command(behind):
     """140 samples of a servo whose command, linear between samples, passes a gear."""
     time = np.arange(140) * 0.04
     command = np.sin(1.7 * time) + 0.5 * np.sin(4.1 * time + 1.0)
@@ -182,28 +184,28 @@ def commanded(behind):
     def rate(t, y):
         return [y[1], 25.0 * (np.interp(t, finely, seen) - y[0]) - 4.0 * y[1]]
 
-    return measured(rate, [0.0, 0.0], time, NOISE, seen=("angle",), command=command)
+    return solved_recording(rate, [0.0, 0.0], time, NOISE, seen=("angle",), command=command)
 
 
-def with_play(command):
-    """The load stands still until the drive has crossed the gap."""
+def backlash_output(command):
+    """Return the load angle: it is constant until the drive has crossed the gap."""
     load = command.copy()
     for k in range(1, len(load)):
         load[k] = load[k - 1] + np.sign(command[k] - load[k - 1]) * max(abs(command[k] - load[k - 1]) - 0.14, 0.0)
     return load
 
 
-def without_small_ones(command):
+def dead_zone_output(command):
     return command - np.clip(command, -0.14, 0.14)
 
 
 @pytest.mark.e2e
 @pytest.mark.parametrize(
-    ("hidden", "name", "size"), [(with_play, "backlash", "half_gap"), (without_small_ones, "dead_zone", "width")]
+    ("hidden", "name", "size"), [(backlash_output, "backlash", "half_gap"), (dead_zone_output, "dead_zone", "width")]
 )
 def test_backlash_and_a_dead_zone_are_separable(hidden, name, size):
-    diagnosis = diagnose(Servo(), commanded(hidden), effects=among("backlash", "dead_zone"), **QUICK)
-    finding = explained(diagnosis, name)
+    diagnosis = diagnose(Servo(), servo_command(hidden), effects=effects_named("backlash", "dead_zone"), **QUICK)
+    finding = only_confirmed_finding(diagnosis, name)
     assert value(finding, "share")[0] == pytest.approx(1.0, abs=0.1)
     assert value(finding, size)[0] == pytest.approx(0.14, abs=0.01)
     assert all(alternative.separable for alternative in finding.alternatives)
@@ -217,9 +219,9 @@ def test_a_hysteretic_spring_is_named_and_sized():
         angle, v, z = y
         return [v, -9.0 * math.sin(angle) - 0.05 * v - 2.0 * z, v - 3.0 * abs(v) * z - v * abs(z)]
 
-    recording = measured(rate, [1.2, 0.0, 0.0], np.arange(300) * 0.02, NOISE, seen=("angle",))
-    rivals = among("bouc_wen_hysteresis", "coulomb_friction")
-    finding = explained(diagnose(Pendulum(), recording, effects=rivals, **QUICK), "bouc_wen_hysteresis")
+    recording = solved_recording(rate, [1.2, 0.0, 0.0], np.arange(300) * 0.02, NOISE, seen=("angle",))
+    rivals = effects_named("bouc_wen_hysteresis", "coulomb_friction")
+    finding = only_confirmed_finding(diagnose(Pendulum(), recording, effects=rivals, **QUICK), "bouc_wen_hysteresis")
     assert value(finding, "stiffness")[0] == pytest.approx(2.0, abs=0.5)
     assert value(finding, "yield_deflection")[0] == pytest.approx(0.25, abs=0.1)
     assert finding.channels == ("rate of speed",)
@@ -246,9 +248,9 @@ def test_added_mass_is_named_and_sized():
     def rate(t, y):
         return [y[1], (np.interp(t, time, force) - 4.0 * y[0] - 0.3 * y[1]) / 1.1]
 
-    recording = measured(rate, [0.5, 0.0], time, NOISE, seen=("heave",), force=force)
-    rivals = among("added_mass", "cubic_stiffness")
-    finding = explained(diagnose(Buoy(), recording, effects=rivals, **QUICK), "added_mass")
+    recording = solved_recording(rate, [0.5, 0.0], time, NOISE, seen=("heave",), force=force)
+    rivals = effects_named("added_mass", "cubic_stiffness")
+    finding = only_confirmed_finding(diagnose(Buoy(), recording, effects=rivals, **QUICK), "added_mass")
     share, error = value(finding, "share")
     assert share == pytest.approx(0.1 / 1.1, abs=0.01)
     assert 0.0 < error < 0.01
@@ -274,8 +276,8 @@ def test_lift_of_a_spinning_ball_is_named_and_sized():
         speed, lift = math.hypot(vx, vy), 0.18 * math.exp(-t / 10.0)
         return [vx, vy, -0.02 * speed * vx - lift * vy, -9.81 - 0.02 * speed * vy + lift * vx]
 
-    recording = measured(rate, [0.0, 1.0, 25.0, 8.0], np.arange(180) * 0.02, NOISE, seen=("x", "y"))
-    rivals = among("magnus_lift", "coupling")
+    recording = solved_recording(rate, [0.0, 1.0, 25.0, 8.0], np.arange(180) * 0.02, NOISE, seen=("x", "y"))
+    rivals = effects_named("magnus_lift", "coupling")
     diagnosis = diagnose(Ball(), recording, effects=rivals, **QUICK)
     assert diagnosis.verdict == "unexplained"  # the lift is not the constant one of the catalogue
     (finding,) = diagnosis.findings
@@ -294,7 +296,7 @@ def test_buoyancy_leads_the_search_of_all_effects():
         lift = 0.4 * deep**2 * (0.9 - deep) / 0.108
         return [y[1], np.interp(t, time, force) - 4.0 * y[0] - 0.3 * y[1] + lift]
 
-    recording = measured(rate, [0.8, 0.0], time, NOISE, seen=("heave",), force=force)
+    recording = solved_recording(rate, [0.8, 0.0], time, NOISE, seen=("heave",), force=force)
     simulation = Buoy().prepare(recording)
     base = fitted(JointModel(simulation), simulation.start())
     terms = candidate_terms(simulation, (), DYNAMICS)
@@ -321,9 +323,9 @@ def test_a_submerged_body_has_a_constant_force():
     def rate(_, y):
         return [y[1], -9.81 - 0.8 * y[1] + 2.0]
 
-    recording = measured(rate, [5.0, 0.0], np.arange(120) * 0.02, NOISE, seen=("height",))
-    rivals = among("buoyancy", "constant_force")
-    finding = explained(diagnose(Sinking(), recording, effects=rivals, **QUICK), "constant_force")
+    recording = solved_recording(rate, [5.0, 0.0], np.arange(120) * 0.02, NOISE, seen=("height",))
+    rivals = effects_named("buoyancy", "constant_force")
+    finding = only_confirmed_finding(diagnose(Sinking(), recording, effects=rivals, **QUICK), "constant_force")
     assert [(a.effect, a.separable) for a in finding.alternatives] == [("buoyancy", False)]
 
 
@@ -338,8 +340,8 @@ class Fall(Dynamics):
         return {"height": x.speed, "speed": -9.81 + 0.0 * x.speed}
 
 
-def dropped(ball):
-    """Both drops of a ball in one table."""
+def drops_recording(ball):
+    """Return both drops of a ball in one table."""
     parts = Recording.read(shared_data("dynamics/falling_balls/ball_drops.csv")).experiments()
     both = [parts[f"{ball}/{k}"] for k in (1, 2)]
     columns = {name: torch.cat([drop[name] for drop in both]) for name in ("time", "height")}
@@ -350,7 +352,7 @@ def dropped(ball):
 @pytest.mark.e2e
 def test_a_light_ball_has_drag():
     """Short drops do not separate the kinds of drag."""
-    diagnosis = diagnose(Fall(), dropped("Whiffle_Ball_1"), **QUICK)
+    diagnosis = diagnose(Fall(), drops_recording("Whiffle_Ball_1"), **QUICK)
     assert diagnosis.verdict == "explained"
     (finding,) = diagnosis.findings
     alike = [rival.effect for rival in finding.alternatives if not rival.separable]
@@ -362,6 +364,6 @@ def test_a_light_ball_has_drag():
 @pytest.mark.e2e
 def test_a_heavy_ball_has_no_finding():
     """Its residual is not only noise, but no effect predicts held-out blocks."""
-    diagnosis = diagnose(Fall(), dropped("Bowling_Ball"), **QUICK)
+    diagnosis = diagnose(Fall(), drops_recording("Bowling_Ball"), **QUICK)
     assert diagnosis.findings == ()
     assert not any(word in text for text in diagnosis.warnings for word in ("drag", "added_mass"))

@@ -44,8 +44,8 @@ class Motor(Dynamics):
         return {"speed": p.gain * u.voltage - p.damping * x.speed}
 
 
-def held(rate, start, inputs, step):
-    """Second state of a system of two, (N,), with its input held over each step; by Heun's method."""
+def integrated_output(rate, start, inputs, step):
+    """Return the second state of a system of two, (N,), with its input held over each step, by Heun's method."""
     state, seen, short = np.array(start, float), [], step / 50
     for value in inputs:
         seen.append(state[1])
@@ -56,16 +56,18 @@ def held(rate, start, inputs, step):
 
 
 def thermometer():
-    """A block at 5 s; the thermometer follows it with 25 s."""
+    """Return a recording of a heated block, sampled every 5 s by a thermometer with a lag of 25 s."""
     random = np.random.default_rng(3)
     power = np.repeat(random.choice([0.0, 30.0, 60.0, 100.0], 5), 48)
-    temp = held(lambda x, u: np.array([(u - 0.9 * (x[0] - 22.0)) / 180.0, (x[0] - x[1]) / 25.0]), [22, 22], power, 5.0)
+    temp = integrated_output(
+        lambda x, u: np.array([(u - 0.9 * (x[0] - 22.0)) / 180.0, (x[0] - x[1]) / 25.0]), [22, 22], power, 5.0
+    )
     temp = temp + random.normal(0.0, 0.1, len(temp))
     return Recording({"time": np.arange(len(temp)) * 5.0, "power": power, "temp": temp})
 
 
 def motor():
-    """A motor behind a driver with a dead zone of 0.8 V, whose current follows with 40 ms."""
+    """Return a recording of a motor behind a driver with a dead zone of 0.8 V and a lag of 40 ms."""
     random = np.random.default_rng(4)
     time = np.arange(300) * 0.02
     voltage = np.round(3.0 * np.sin(2.2 * time) + 1.5 * np.sin(5.7 * time + 1.0), 3)
@@ -75,7 +77,7 @@ def motor():
         passed = np.sign(u) * max(abs(u) - 0.8, 0.0)
         return np.array([(passed - x[0]) / 0.04, 60.0 * x[0] - 5.0 * x[1]])
 
-    speed = held(rate, [0.0, 0.0], voltage, 0.02) + random.normal(0.0, 0.3, len(time))
+    speed = integrated_output(rate, [0.0, 0.0], voltage, 0.02) + random.normal(0.0, 0.3, len(time))
     return Recording({"time": time, "voltage": voltage, "speed": speed})
 
 
@@ -84,7 +86,7 @@ def numbers(finding):
 
 
 @pytest.mark.e2e
-def test_a_slow_thermometer_is_not_taken_for_a_slow_heater():
+def test_a_slow_thermometer_is_a_sensor_lag():
     diagnosis = diagnose(Block(), thermometer(), **QUICK)
     assert diagnosis.verdict == "explained"
     (finding,) = diagnosis.findings
@@ -121,7 +123,7 @@ def test_the_noise_is_estimated_from_the_residual_behind_a_lagging_sensor():
     assert flow_of(system, theta, changes, None).new == pytest.approx(residual, abs=1e-9)
 
 
-def test_effects_with_memory_act_before_others_unless_those_are_first():
+def test_effects_with_memory_act_before_others_except_those_marked_first():
     lag, square = Term(InputLag(), None, {"lag": 1.0}), Term(InputSquare(), None, {})
     before = Term(DeadZone(), None, {}, first=True)
     assert in_order_of_the_chain((square, lag, before), range(3)) == [2, 1, 0]

@@ -14,7 +14,7 @@ from tests.diagnosis.factory import make_diagnosis, make_environment
 
 
 @pytest.fixture(autouse=True)
-def closed():
+def _close_figures():
     yield
     pyplot.close("all")
 
@@ -24,8 +24,8 @@ def found():
     return make_diagnosis(3, samples=300, channels=4, verdict="unexplained", environment=make_environment())
 
 
-def drawn(ax):
-    """What stands on axes: names of both axes and the title."""
+def labels_of(ax):
+    """Return the labels of both axes and the title."""
     return ax.get_xlabel(), ax.get_ylabel(), ax.get_title()
 
 
@@ -41,36 +41,36 @@ PICTURES = {
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_each_draws_on_the_axes_it_is_given_and_on_a_new_figure(found, name):
+def test_every_picture_is_drawn_on_given_axes_or_on_a_new_figure(found, name):
     given = pyplot.subplots()[1]
     assert PICTURES[name](found.plot, given) is given
     assert given.has_data()
     new = PICTURES[name](found.plot, None)
     assert new is not given
-    assert drawn(new) == drawn(given)
-    assert drawn(new)[2]
+    assert labels_of(new) == labels_of(given)
+    assert labels_of(new)[2]
 
 
-def test_every_method_is_tried_here():
+def test_every_plot_method_is_tested():
     methods = {name for name in vars(mkc_torch.diagnosis.DiagnosisPlot) if not name.startswith("_")}
     assert methods == {*PICTURES, "gain_map"}
 
 
-def test_the_residual_has_names_units_and_the_samples(found):
+def test_the_residual_plot_shows_channel_unit_and_samples(found):
     ax = found.plot.residual("turn_y", corrected=False)
-    assert drawn(ax) == ("time (s)", f"residual ({found.traces.unit})", "Before, turn_y")
+    assert labels_of(ax) == ("time (s)", f"residual ({found.traces.unit})", "Before, turn_y")
     samples = max((line.get_ydata() for line in ax.lines if line.get_marker() == "."), key=len)
     before, used = found.traces.before[:, 2].numpy(), found.traces.weight[:, 2].numpy() >= 0.5
     shown = before[used][np.abs(before[used]) <= ax.get_ylim()[1]]
     np.testing.assert_array_equal(samples, shown)
 
 
-def test_after_stands_the_size_before_behind_the_samples(found):
+def test_the_residual_plot_is_titled_after_if_there_are_findings(found):
     assert found.plot.residual().get_title() == "After, norm"
     assert make_diagnosis(0, samples=200).plot.residual().get_title().startswith("Residual")
 
 
-def test_the_effect_is_that_of_the_finding(found):
+def test_the_effect_plot_shows_the_curve_of_the_finding(found):
     curve = found.findings[1].curve
     ax = found.plot.effect(1)
     lines = [line for line in ax.lines if len(line.get_xdata()) == len(curve.x)]
@@ -79,7 +79,7 @@ def test_the_effect_is_that_of_the_finding(found):
     assert curve.unit in ax.get_xlabel()
 
 
-def test_gains_on_unseen_blocks_stand_with_their_intervals(found):
+def test_the_held_out_plot_shows_gains_with_their_intervals(found):
     ax = found.plot.held_out()
     known = [f.held_out for f in found.findings if f.held_out is not None]
     points = [float(line.get_xdata()[0]) for line in ax.lines if line.get_marker() == "o"]
@@ -88,7 +88,7 @@ def test_gains_on_unseen_blocks_stand_with_their_intervals(found):
     assert spans == [one.confidence_interval for one in known]
 
 
-def test_bars_are_the_gains_in_the_order_of_the_search(found):
+def test_the_candidates_plot_has_bars_of_gains_in_the_order_of_the_search(found):
     shown = dataclasses.replace(found, candidates=found.candidates[::-1])
     widths = [bar.get_width() for bar in shown.plot.candidates(5).patches]
     assert widths == [max(c.log_likelihood_gain, 0.0) for c in shown.candidates[:5]]
@@ -111,13 +111,13 @@ def test_bars_are_the_gains_in_the_order_of_the_search(found):
         (lambda d: dataclasses.replace(d, candidates=()).plot.candidates(), "no candidates"),
     ],
 )
-def test_what_is_not_there_is_a_clear_error(found, draw, words):
+def test_arguments_without_a_picture_raise_with_the_valid_values(found, draw, words):
     with pytest.raises(ValueError, match=words):
         draw(found)
     assert pyplot.get_fignums() == []  # no empty figure is left
 
 
-def test_a_map_is_drawn_where_there_is_one(found):
+def test_a_gain_map_is_drawn_or_raises_if_absent(found):
     with_map = next((i for i, f in enumerate(found.findings) if f.map is not None), None)
     if with_map is None:
         with pytest.raises(ValueError, match="no map over two states"):
@@ -126,12 +126,12 @@ def test_a_map_is_drawn_where_there_is_one(found):
         assert found.plot.gain_map(with_map).has_data()
 
 
-def test_axes_that_are_none_are_a_type_error(found):
+def test_axes_of_another_type_raise(found):
     with pytest.raises(TypeError, match=r"`ax`.*axes of matplotlib or None.*got Figure"):
         found.plot.residual(ax=pyplot.figure())
 
 
-def test_a_notebook_shows_the_findings_and_text_from_files_is_escaped(found):
+def test_the_notebook_view_shows_findings_and_escapes_text_from_files(found):
     page = dataclasses.replace(found, recording="<b>x</b>")._repr_html_()
     assert "&lt;b&gt;x" in page
     assert "<b>" not in page

@@ -65,7 +65,7 @@ def test_every_number_is_documented():
     } == {}
 
 
-def test_an_undocumented_number_is_found():
+def test_an_undocumented_number_is_detected():
     source = 'A = 1.0\n"""Said."""\n\n# said\nB = -2\nC, D = 3, 4\nE = 2.0 * math.log(3.0)\nF = 5  # said\nG = "text"\n'
     assert list(undocumented(source)) == ["C, D = (3, 4)", "E = 2.0 * math.log(3.0)"]
 
@@ -127,7 +127,7 @@ def diagnosis(settings):
 
 
 @pytest.fixture(scope="module")
-def usual():
+def diagnosis_with_default_settings():
     return diagnosis(Settings())
 
 
@@ -138,8 +138,8 @@ def test_other_types_than_settings_raise(other):
 
 
 @pytest.mark.e2e
-def test_the_known_driver_is_named_and_separable_from_the_column(usual):
-    (finding,) = usual.findings
+def test_the_known_driver_is_named_and_separable_from_the_column(diagnosis_with_default_settings):
+    (finding,) = diagnosis_with_default_settings.findings
     (rival,) = finding.alternatives
     assert (finding.effect, rival.effect, rival.separable) == ("current_field", "driver_offset", True)
 
@@ -151,32 +151,34 @@ def test_without_its_penalty_the_column_is_named():
 
 
 @pytest.mark.e2e
-def test_rivals_within_separable_are_inseparable(usual):
-    far = 2.0 * usual.findings[0].alternatives[0].log_likelihood_gap
+def test_rivals_within_separable_are_inseparable(diagnosis_with_default_settings):
+    far = 2.0 * diagnosis_with_default_settings.findings[0].alternatives[0].log_likelihood_gap
     (finding,) = diagnosis(Settings(naming=NamingSettings(separable=far))).findings
     assert (finding.effect, finding.alternatives[0].separable) == ("current_field", False)
     assert finding.alternatives[0].distinguishing_state
 
 
 @pytest.mark.e2e
-def test_remaining_gain_is_the_limit_of_the_warning(usual):
-    warned = [warning for warning in usual.warnings if "smooth trend along load" in warning]
+def test_remaining_gain_is_the_limit_of_the_warning(diagnosis_with_default_settings):
+    warned = [warning for warning in diagnosis_with_default_settings.warnings if "smooth trend along load" in warning]
     assert len(warned) == 1
     quiet = diagnosis(Settings(evidence=EvidenceSettings(remaining_gain=100.0)))
     assert not set(warned) & set(quiet.warnings)
-    assert (usual.verdict, quiet.verdict) == ("unexplained", "explained")
+    assert (diagnosis_with_default_settings.verdict, quiet.verdict) == ("unexplained", "explained")
 
 
 @pytest.mark.e2e
-def test_folds_change_the_held_out_evidence(usual):
+def test_folds_change_the_held_out_evidence(diagnosis_with_default_settings):
     held_out = diagnosis(Settings(confirmation=ConfirmationSettings(folds=3))).findings[0].held_out
-    assert held_out.log_likelihood_gain != usual.findings[0].held_out.log_likelihood_gain
+    assert held_out.log_likelihood_gain != diagnosis_with_default_settings.findings[0].held_out.log_likelihood_gain
 
 
 @pytest.mark.e2e
-def test_rejected_below_changes_the_gains(usual):
+def test_rejected_below_changes_the_gains(diagnosis_with_default_settings):
     rejecting = diagnosis(Settings(noise=NoiseSettings(rejected_below=0.8)))
-    assert rejecting.candidates[0].log_likelihood_gain != usual.candidates[0].log_likelihood_gain
+    assert (
+        rejecting.candidates[0].log_likelihood_gain != diagnosis_with_default_settings.candidates[0].log_likelihood_gain
+    )
 
 
 def test_a_recording_shorter_than_fewest_samples_raises():
@@ -189,7 +191,9 @@ def test_a_column_below_fewest_finite_is_left_out():
     recording, taken = Recording({"time": time, "load": load}), frozenset({"time"})
     assert len(find_drivers(recording, taken, DriverSettings()).drivers) == 1
     found = find_drivers(recording, taken, DriverSettings(fewest_finite=0.9))
-    assert (found.drivers, found.warnings) == ((), ("Column `load` has only 80% finite values and is left out.",))
+    (warning,) = found.warnings
+    assert found.drivers == ()
+    assert "`load` has only 80% finite values" in warning
 
 
 @pytest.mark.parametrize(

@@ -187,13 +187,13 @@ def run_example(script: str, arguments: list[str], folder: Path) -> None:
 
 
 def script_of(module: str) -> str:
-    """The file that `python -m` runs for a module or package of the examples."""
+    """Return the file that `python -m` runs for a module or package of the examples."""
     place = module.replace(".", "/")
     return f"{place}/__main__.py" if (ROOT / place).is_dir() else f"{place}.py"
 
 
 def example_options(script: str) -> set[str]:
-    """The options of a script and of the modules that it imports from its folder."""
+    """Return the options of a script and of the modules that it imports from its folder."""
     own = (ROOT / script).read_text(encoding="utf-8")
     imported = [
         (ROOT / script).with_name(f"{name}.py") for name in re.findall(r"^from (\w+) import", own, re.MULTILINE)
@@ -203,7 +203,7 @@ def example_options(script: str) -> set[str]:
 
 
 def mkc_options(command: str) -> set[str]:
-    """The options of a command of mkc."""
+    """Return the options of a command of mkc."""
     return {option for parameter in MKC[command].params for option in parameter.opts if option.startswith("--")}
 
 

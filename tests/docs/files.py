@@ -33,9 +33,9 @@ def write_examples(folder: Path) -> None:
         "FLIGHT": concealed_recording(0).columns,
         "BENCH": concealed_recording(2).columns,
         "NEW": concealed_recording(1).columns,
-        "VEHICLE": vehicle(),
-        "SIDES": sides(),
-        "SUPPLY": supplied(),
+        "VEHICLE": vehicle_recording(),
+        "SIDES": accelerometer_recording(),
+        "SUPPLY": supply_recording(),
         "RUNS": joined(pendulum(0), pendulum(1)),
         "NEW_RUN": pendulum(2),
         "SIM": simulated,
@@ -48,8 +48,8 @@ def write_examples(folder: Path) -> None:
         make_fmu(folder / "pendulum.fmu", PENDULUM)
 
 
-def vehicle(samples: int = 1500, rate: float = 25.0) -> dict[str, Tensor]:
-    """A magnetometer and a gyroscope that tilt by ten degrees and rotate about the vertical."""
+def vehicle_recording(samples: int = 1500, rate: float = 25.0) -> dict[str, Tensor]:
+    """Return a recording of a magnetometer and a gyroscope that tilt by ten degrees and rotate about the vertical."""
     draw = torch.Generator().manual_seed(0)
     time = torch.arange(samples, dtype=torch.float64) / rate
     lean, zero = 0.17 * torch.sin(0.9 * time), torch.zeros(samples, dtype=torch.float64)
@@ -65,8 +65,8 @@ def vehicle(samples: int = 1500, rate: float = 25.0) -> dict[str, Tensor]:
     return {"time": time, **dict(zip(names, columns, strict=True))}
 
 
-def sides() -> dict[str, Tensor]:
-    """An accelerometer, turned in all directions."""
+def accelerometer_recording() -> dict[str, Tensor]:
+    """Return a recording of an accelerometer, turned in all directions."""
     draw = torch.Generator().manual_seed(0)
     way = torch.nn.functional.normalize(torch.randn(400, 3, generator=draw, dtype=torch.float64), dim=-1)
     force = 9.80665 * way * torch.tensor([1.01, 0.99, 1.0]) + torch.tensor([0.1, -0.2, 0.05])
@@ -74,8 +74,8 @@ def sides() -> dict[str, Tensor]:
     return dict(zip(("accel_x", "accel_y", "accel_z"), force.unbind(-1), strict=True))
 
 
-def supplied() -> dict[str, Tensor]:
-    """A sensor whose offset follows a voltage."""
+def supply_recording() -> dict[str, Tensor]:
+    """Return a recording of a sensor whose offset follows a voltage."""
     columns = dict(concealed_recording(3).columns)
     voltage = 12.0 + torch.sin(0.23 * columns["time"]) + 0.5 * torch.sin(1.1 * columns["time"])
     del columns["current"]
@@ -83,7 +83,7 @@ def supplied() -> dict[str, Tensor]:
 
 
 def pendulum(number: int, samples: int = 150, rate: float = 20.0) -> dict[str, Tensor]:
-    """A driven pendulum with air drag, integrated in twenty steps a sample; the noise of its angle is 5 mrad."""
+    """Return a recording of a driven pendulum with air drag; the noise of its angle is 5 mrad."""
     noise = torch.randn(samples, generator=torch.Generator().manual_seed(number), dtype=torch.float64)
     time = torch.arange(samples, dtype=torch.float64) / rate
     torque = 1.2 * torch.sin(0.9 * time + number) + torch.sin(2.7 * time + 2 * number)
@@ -104,7 +104,7 @@ def joined(*runs: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def paired(number: int, samples: int = 300) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """A simulation and a recording, which is larger by eight per cent and depends slightly on temperature."""
+    """Return a simulation and a recording, which is larger by eight per cent and depends slightly on temperature."""
     noise = torch.randn(samples, generator=torch.Generator().manual_seed(number), dtype=torch.float64)
     time = torch.arange(samples, dtype=torch.float64) / 20.0
     temperature = 20.0 + 5.0 * torch.sin(0.3 * time + number) + 0.2 * time

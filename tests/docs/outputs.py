@@ -47,7 +47,7 @@ class Printed:
         self._of_block = "".join(text for _, text in outputs)
 
     def of(self, mark: re.Match[str]) -> list[str]:
-        """The lines that a block with this mark shows.
+        """Return the lines that a block with this mark shows.
 
         Raises:
             AssertionError: no command begins so.
@@ -102,7 +102,7 @@ def run_page(page: Path, folder: Path) -> tuple[dict[str, object], list[tuple[Bl
 
 
 def mark_of(lines: Sequence[str], block: Block) -> re.Match[str] | None:
-    """The mark above a block of output, with an empty line between; None for other blocks."""
+    """Return the mark above a block of output, with an empty line between; None for other blocks."""
     above = [line for line in lines[max(block.line - 4, 0) : block.line - 2] if line]
     return MARK.match(above[-1]) if above and block.language == "text" else None
 
@@ -146,7 +146,7 @@ def differences(shown: Sequence[str], printed: Sequence[str]) -> Iterator[str]:
 
 
 def filled(shown: Sequence[str], printed: Sequence[str]) -> list[str]:
-    """The printed lines; of a block with `…`, the printed lines that begin with the first word of each shown line.
+    """Return the printed lines; of a block with `…`, those that start with the first word of each shown line.
 
     Indented lines belong to the line before them.
 

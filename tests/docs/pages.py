@@ -49,12 +49,12 @@ def blocks(page: Path) -> Iterator[Block]:
 
 
 def prose(page: Path) -> str:
-    """The page without its fenced blocks."""
+    """Return the page without its fenced blocks."""
     return re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
 
 
 def inline(page: Path) -> list[str]:
-    """The inline code of the prose, each piece on a single line."""
+    """Return the inline code of the prose, each piece on a single line."""
     return [" ".join(found.replace(r"\|", "|").split()) for found in re.findall(r"`([^`]+)`", prose(page))]
 
 
@@ -65,6 +65,6 @@ def links(page: Path) -> list[str]:
 
 
 def anchors(page: Path) -> set[str]:
-    """The anchors of the headings of the page, as GitHub makes them."""
+    """Return the anchors of the headings of the page, as GitHub makes them."""
     headings = re.findall(r"^#+ (.+)$", prose(page), flags=re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}

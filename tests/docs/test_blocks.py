@@ -20,15 +20,15 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:Starting from v1.9.0, `tensorboardX`"),
 ]
 
-WITH_BLOCKS = [page for page in PAGES if any(block.language in RUN for block in blocks(page))]
+PAGES_WITH_CODE = [page for page in PAGES if any(block.language in RUN for block in blocks(page))]
 
-FOUND = {
+EXPECTED_FINDINGS = {
     "diagnose": {"result": "current_field"},
     "own_simulation": {"result": "quadratic_drag", "paired": "gain", "supplied": "supply_offset"},
 }
 """First findings of the diagnoses of a page, by the name of the diagnosis in the page."""
 
-NEEDS = {"large_data": "pyarrow", "own_simulation": "fmpy"}
+PACKAGES_OF_PAGES = {"large_data": "pyarrow", "own_simulation": "fmpy"}
 """Packages that a page needs in addition to those of all pages."""
 
 OPTIONAL = [block for page in PAGES for block in blocks(page) if block.needs is not None]
@@ -44,7 +44,7 @@ def examples(tmp_path_factory):
 
 @pytest.fixture
 def folder(examples, tmp_path, monkeypatch):
-    """The working folder of a reader: the tables, and nothing else."""
+    """Return the working folder of a reader: the tables, and nothing else."""
     for table in examples.iterdir():
         (tmp_path / table.name).symlink_to(table)
     monkeypatch.chdir(tmp_path)
@@ -52,15 +52,15 @@ def folder(examples, tmp_path, monkeypatch):
 
 
 @pytest.mark.manual
-@pytest.mark.parametrize("page", WITH_BLOCKS, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", PAGES_WITH_CODE, ids=lambda page: page.stem)
 def test_every_block_of_a_page_runs(page, folder):
-    if page.stem in NEEDS:
-        pytest.importorskip(NEEDS[page.stem])
+    if page.stem in PACKAGES_OF_PAGES:
+        pytest.importorskip(PACKAGES_OF_PAGES[page.stem])
     if page.stem == "own_simulation" and COMPILER is None:
         pytest.skip("there is no compiler of C for its FMU")
     names, shown = run_page(page, folder)
-    found = {name: names[name].findings[0].effect for name in FOUND.get(page.stem, {})}
-    assert found == FOUND.get(page.stem, {})
+    found = {name: names[name].findings[0].effect for name in EXPECTED_FINDINGS.get(page.stem, {})}
+    assert found == EXPECTED_FINDINGS.get(page.stem, {})
     for block, printed in shown:
         wrong = list(differences(block.text.splitlines(), printed))
         assert not wrong, f"{block}: `python -m tests.docs.outputs` fills in\n" + "\n".join(wrong)
@@ -68,7 +68,7 @@ def test_every_block_of_a_page_runs(page, folder):
 
 @pytest.mark.parametrize("block", OPTIONAL, ids=str)
 def test_the_package_of_an_optional_block_is_installed(block):
-    """If so, the test before has run the block; if not, the skip names the package."""
+    """The block runs with its page; if its package is absent, the skip names the package."""
     pytest.importorskip(block.needs)
 
 

@@ -17,13 +17,13 @@ LOSS, LOSSES = (ROOT / "docs" / f"{name}.md" for name in ("loss", "losses"))
 
 
 def rows(page, first):
-    """The cells of the table rows whose first cell matches, without the asterisks of bold type."""
+    """Return the cells of the table rows whose first cell matches, without the asterisks of bold type."""
     lines = [line for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("|")]
     cells = [[cell.strip().strip("*") for cell in line.strip("|").split("|")] for line in lines]
     return [row for row in cells if re.fullmatch(first, row[0])]
 
 
-def defined(page, name, **names):
+def definition_of(page, name, **names):
     """Execute the definition of a function or class in a page, and return it."""
     (block,) = [block for block in blocks(page) if re.search(rf"^(def|class) {name}\b", block.text, re.MULTILINE)]
     source = re.search(rf"^(?:def|class) {name}\b.*?(?=^\S|\Z)", block.text, re.MULTILINE | re.DOTALL)[0]
@@ -117,7 +117,7 @@ def test_the_script_makes_the_pictures_of_the_page(tmp_path, monkeypatch):
 # --- functions to copy
 
 
-class StandIn:
+class TrainerStub:
     """Calls a ``compute_loss_func`` as the Trainer of transformers 5 does, gradients accumulated over batches."""
 
     def __init__(self, model, compute_loss_func):
@@ -137,14 +137,14 @@ class StandIn:
 
 @pytest.fixture
 def network():
-    """The network of the page with a loss without state, and its ``compute_loss_func``."""
+    """Return the network of the page with a loss without state, and its ``compute_loss_func``."""
     torch.manual_seed(0)
-    network = defined(LOSSES, "Network", torch=torch, MKCLoss=MKCLoss)()
+    network = definition_of(LOSSES, "Network", torch=torch, MKCLoss=MKCLoss)()
     network.criterion = MKCLoss(2, sigma=2.0, d=0.5, bound=50.0, reduction="sum")
-    return network, defined(LOSSES, "compute_loss_func", network=network)
+    return network, definition_of(LOSSES, "compute_loss_func", network=network)
 
 
-def test_the_function_for_transformers_has_its_signature(network):
+def test_the_function_for_transformers_has_the_signature_of_compute_loss_func(network):
     _, function = network
     signature = inspect.signature(function)
     assert list(signature.parameters) == ["outputs", "labels", "num_items_in_batch"]
@@ -155,7 +155,7 @@ def test_accumulated_batches_have_the_gradient_of_the_whole_batch(network):
     model, function = network
     features, labels = torch.randn(2, 60, 8, generator=torch.Generator().manual_seed(1))
     labels = labels[:, :2]
-    trainer = StandIn(model, function)
+    trainer = TrainerStub(model, function)
     whole = trainer.gradients([{"features": features, "labels": labels}])
     parts = [
         {"features": f, "labels": t} for f, t in zip(features.split([10, 50]), labels.split([10, 50]), strict=True)
@@ -167,7 +167,7 @@ def test_accumulated_batches_have_the_gradient_of_the_whole_batch(network):
 
 
 def test_gradients_of_a_loss_outside_the_wrapped_module_are_averaged(tmp_path):
-    average = defined(LOSS, "average_gradients", torch=torch)
+    average = definition_of(LOSS, "average_gradients", torch=torch)
     loss = MKCLoss(2, d=0.5, bound=50.0)
     loss(torch.randn(20, 2), torch.randn(20, 2)).backward()
     before = [parameter.grad.clone() for parameter in loss.parameters()]

@@ -1,4 +1,4 @@
-"""Outputs in pages: what is typed instead of printed is detected."""
+"""Outputs in pages: lines that no block prints are detected."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from tests.docs.outputs import agree, differences, filled
 PRINTED = ["offset     11.969 ± 0.017", "noise      0.473 µT", "", "rejected   5.1 %"]
 
 
-def test_what_is_printed_agrees():
+def test_shown_lines_that_agree_with_the_output_have_no_differences():
     assert list(differences(PRINTED, PRINTED)) == []
     assert list(differences([PRINTED[0].replace("11.969", "11.968"), "…", PRINTED[3]], PRINTED)) == []
     assert list(differences(["…", "noise      0.47…", "…"], PRINTED)) == []
@@ -24,7 +24,7 @@ def test_what_is_printed_agrees():
         ["…", PRINTED[3], PRINTED[0], "…"],  # in another order
     ],
 )
-def test_what_is_not_printed_differs(shown):
+def test_incomplete_changed_or_reordered_lines_differ(shown):
     assert list(differences(shown, PRINTED))
 
 
@@ -34,7 +34,7 @@ def test_a_number_of_another_sign_or_size_differs():
     assert not agree("p = 0.01", "p = 0.02")
 
 
-def test_blocks_are_filled_in():
+def test_filled_replaces_shown_lines_by_printed_lines():
     assert filled([], PRINTED) == PRINTED
     assert filled(["…", "noise  9 µT", "…"], PRINTED) == ["…", "noise      0.473 µT", "…"]
     two_lines = ["noise  9 µT,", "       white", "rejected   1"]

@@ -11,7 +11,7 @@ yaml = pytest.importorskip("yaml")
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 RECIPE = yaml.safe_load((ROOT / ".github" / "conda" / "recipe.yaml").read_text(encoding="utf-8"))
-OF_CONDA = {"torch": "pytorch", "matplotlib": "matplotlib-base"}
+CONDA_NAMES = {"torch": "pytorch", "matplotlib": "matplotlib-base"}
 """Packages that conda names otherwise."""
 
 
@@ -20,13 +20,13 @@ def test_the_recipe_has_the_version_and_the_requirements_of_the_package():
     assert f">={RECIPE['context']['python_min']}" == PROJECT["requires-python"]
     needed = [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["cli"]]
     names = (re.fullmatch(r"([\w-]+)(>=.+)", text).groups() for text in needed)
-    expected = {f"{OF_CONDA.get(name, name)} {version}" for name, version in names}
+    expected = {f"{CONDA_NAMES.get(name, name)} {version}" for name, version in names}
     assert set(RECIPE["requirements"]["run"]) - {"python >=${{ python_min }}"} == expected
     assert RECIPE["build"]["python"]["entry_points"] == [f"mkc = {PROJECT['scripts']['mkc']}"]
     assert RECIPE["about"]["summary"] == PROJECT["description"]
 
 
-def test_the_classifiers_are_the_versions_of_python_that_are_tested():
+def test_the_classifiers_are_the_tested_versions_of_python():
     workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8"))
     tested = workflow["jobs"]["matrix"]["strategy"]["matrix"]["python"]
     prefix = "Programming Language :: Python :: 3."

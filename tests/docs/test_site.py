@@ -15,14 +15,16 @@ from tests.docs.commands import BUILD
 from tests.docs.pages import PAGES, ROOT
 
 API = ROOT / "docs" / "api"
-ROOMS = re.findall(r"^::: (\S+)\n(?! )", "\n".join(page.read_text(encoding="utf-8") for page in API.glob("*.md")), re.M)
+REFERENCED_PACKAGES = re.findall(
+    r"^::: (\S+)\n(?! )", "\n".join(page.read_text(encoding="utf-8") for page in API.glob("*.md")), re.M
+)
 VERSION = re.search(r'^version = "(.+)"$', (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.M)[1]
 DATE = re.search(r"date-released: (\S+)", (ROOT / "CITATION.cff").read_text(encoding="utf-8"))[1]
 LOADS = {"script": "src", "link": "href", "img": "src", "iframe": "src", "source": "src", "object": "data"}
 
 
-def public():
-    """The public packages that the page on architecture names."""
+def public_packages():
+    """Return the public packages that the page on architecture names."""
     text = " ".join((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split())
     sentence = re.search(r"Public names are those of (.+?), without an underscore", text)[1]
     return [name if name.startswith("mkc_torch") else f"mkc_torch{name}" for name in re.findall(r"`(.+?)`", sentence)]
@@ -45,7 +47,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The site, built from a copy: the command writes into the folder of its sources."""
+    """Return the site, built from a copy: the command writes into the folder of its sources."""
     if find_spec("zensical") is None or find_spec("mkdocstrings_handlers") is None:
         pytest.skip("the extra `docs` is not installed")
     folder = tmp_path_factory.mktemp("site")
@@ -61,8 +63,8 @@ def site(tmp_path_factory):
 
 
 def test_every_public_package_has_a_page():
-    assert {*public(), "mkc_torch.density", "mkc_torch.report"} == {"mkc_torch", *ROOMS}
-    assert len(ROOMS) == len(set(ROOMS))
+    assert {*public_packages(), "mkc_torch.density", "mkc_torch.report"} == {"mkc_torch", *REFERENCED_PACKAGES}
+    assert len(REFERENCED_PACKAGES) == len(set(REFERENCED_PACKAGES))
 
 
 def test_every_page_is_in_the_navigation():
@@ -81,7 +83,11 @@ def test_pictures_are_small_and_shown():
 def test_every_public_name_is_documented(site):
     pytest.importorskip("lightning")
     ids = set().union(*(Page(path).ids for path in (site / "api").glob("*.html")))
-    names = {f"{room}.{name}" for room in ("mkc_torch", *ROOMS) for name in importlib.import_module(room).__all__}
+    names = {
+        f"{room}.{name}"
+        for room in ("mkc_torch", *REFERENCED_PACKAGES)
+        for name in importlib.import_module(room).__all__
+    }
     assert len(names) > 150
     assert names - ids == set()
 

@@ -56,14 +56,14 @@ def test_the_second_block_of_the_readme_runs_the_tests():
     assert "python -m pytest -q -n auto --doctest-modules mkc_torch examples/blind_proof\n" in script
 
 
-def test_the_readme_leads_to_every_page():
+def test_the_readme_links_to_every_page():
     assert {page.name for page in PAGES[1:]} == MANUAL
     led = {target.partition("#")[0].removeprefix("docs/") for target in links(README) if target.startswith("docs/")}
     assert led - FOLDERS == MANUAL
 
 
 @each_page
-def test_links_lead_somewhere(page):
+def test_link_targets_exist(page):
     for target in links(page):
         path, _, heading = target.partition("#")
         place = (page.parent / path).resolve() if path else page
@@ -72,21 +72,21 @@ def test_links_lead_somewhere(page):
 
 
 @each_page
-def test_lines_have_a_normal_width(page):
+def test_lines_are_at_most_120_characters_wide(page):
     """Table rows may be longer."""
     for line in prose(page).splitlines():
         assert len(line) <= 120 or line.startswith("|"), f"{page.name}: {line}"
 
 
 @each_page
-def test_names_exist(page):
+def test_names_in_inline_code_exist(page):
     for text in inline(page):
         for name in re.findall(r"\bmkc_torch(?:\.\w+)+", text):
             assert pydoc.locate(name) is not None, f"{page.name}: {name}"
 
 
 @each_page
-def test_commands_named_in_a_sentence_exist(page):
+def test_commands_and_options_in_inline_code_exist(page):
     known = COMMON.union(*(mkc_options(command) for command in MKC))
     texts = [block.text for block in blocks(page)]
     scripts = {word for text in texts for word in re.findall(r"examples/\S+\.py", text)}
@@ -106,11 +106,11 @@ def test_commands_named_in_a_sentence_exist(page):
 
 
 @pytest.mark.parametrize("command", ["calibrate", "diagnose"])
-def test_every_option_is_explained(command):
+def test_every_option_is_documented(command):
     named = " ".join(inline(ROOT / "docs" / f"{command}.md"))
     assert {option for option in mkc_options(command) if option not in named} == set()
 
 
-def test_every_effect_of_the_catalogue_is_explained():
+def test_every_effect_of_the_catalogue_is_documented():
     named = {*inline(ROOT / "docs" / "diagnose.md"), *inline(ROOT / "docs" / "own_simulation.md")}
     assert {effect.id for effect in CATALOGUE} <= named

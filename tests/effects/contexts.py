@@ -11,7 +11,7 @@ UNITS = {"temperature": ("°C",), "current": ("A",), "position": ("m", "m", "m")
 
 
 def make_context(effect, N=60, channels=("x", "y", "z")):
-    """A context with uneven times, random drivers of the effect's first role, and a random signal of 30 µT."""
+    """Return a context with uneven times, random drivers of the effect's first role, and a random signal of 30 µT."""
     generator = torch.Generator().manual_seed(3)
     units = UNITS.get(effect.roles[0], ("V",)) if effect.roles else ()
     time = 5.0 + 0.5 * torch.rand(N, generator=generator, dtype=torch.float64).cumsum(0)
@@ -21,14 +21,14 @@ def make_context(effect, N=60, channels=("x", "y", "z")):
 
 
 def heading_context(N=60):
-    """A context of a recorded heading with two resets."""
+    """Return a context of a recorded heading with two resets."""
     time = 0.1 * torch.arange(N, dtype=torch.float64)
     since = torch.stack([time > 1.0, time > 4.0], -1).double()
     return Context(time, time.new_zeros(N, 0), (), since, "°", ("heading",), ("since_1", "since_2"))
 
 
 def dynamic_context(effect, N=80, driven=False):
-    """A context with uneven times at a port that has all parts an effect may need."""
+    """Return a context with uneven times at a port that has all parts an effect may need."""
     generator = torch.Generator().manual_seed(1)
     time = 0.02 + 0.05 * torch.rand(N, generator=generator, dtype=torch.float64).cumsum(0)
     drivers, driver_units = time.new_zeros(N, 0), ()
@@ -60,7 +60,7 @@ def oscillating(N, count):
 
 
 def paired_context(effect, N=120):
-    """The context of an output in V that is compared with a simulated output."""
+    """Return the context of an output in V that is compared with a simulated output."""
     time = torch.arange(N, dtype=torch.float64) / 10.0
     names = ("y", "z") if SEVERAL in effect.needs else ("y",)
     signal = torch.stack([2.0 * torch.sin((1.3 + 0.4 * k) * time) + 0.2 for k, _ in enumerate(names)], -1)
@@ -73,7 +73,7 @@ def paired_context(effect, N=120):
 
 
 def contexts_of(effect):
-    """Every kind of context of an effect of the catalogue or of a user's own sensor effect."""
+    """Return every kind of context of an effect of the catalogue or of a user's own sensor effect."""
     if effect.port == "heading":
         return (heading_context(),)
     if effect in PAIRED or any(type(known.simpler) is type(effect) for known in PAIRED if known.simpler):
@@ -84,7 +84,7 @@ def contexts_of(effect):
 
 
 def within(effect, shape, context):
-    """The shape with ranges scaled by the lowest and highest value of their part."""
+    """Return the shape with ranges scaled by the lowest and highest value of their part."""
     shape = dict(shape)
     for name, (part, which) in effect.relative.items():
         if which in ("lowest", "highest"):
@@ -94,7 +94,7 @@ def within(effect, shape, context):
 
 
 def kinds_of_shapes(effect, context):
-    """The first and the last shape of an effect of each set of shape parameters."""
+    """Return the first and the last shape of an effect of each set of shape parameters."""
     kinds = {}
     for shape in (within(effect, shape, context) for shape in effect.shapes(context.time)):
         kinds.setdefault(tuple(sorted(shape)), []).append(shape)
@@ -102,5 +102,5 @@ def kinds_of_shapes(effect, context):
 
 
 def size_of(effect, shape, context):
-    """The number of amplitudes."""
+    """Return the number of amplitudes."""
     return sum(quantity.size for quantity in effect.quantities(shape, context))

@@ -40,7 +40,7 @@ def cases(effects):
 
 
 def over_all_cases(cases):
-    """A decorator of a class: each of its tests runs over all cases and names the failing case.
+    """Return a decorator of a class: each of its tests runs over all cases and names the failing case.
 
     Args:
         cases: a function that returns the cases, with their arguments and names.
@@ -75,7 +75,7 @@ def random_gammas(count, size):
 class OfEveryEffect:
     """Tests of an effect, with the argument ``effect``."""
 
-    def test_it_is_an_effect_with_an_id_a_port_and_roles(self, effect):
+    def test_an_effect_has_an_id_a_port_and_roles(self, effect):
         assert isinstance(effect, Effect)
         assert effect.id.isidentifier()
         assert effect.port

@@ -49,7 +49,7 @@ def test_a_magnet_at_the_element_adds_a_square_to_the_cube():
     torch.testing.assert_close(change, left)
 
 
-def test_units_of_drivers_without_a_unit():
+def test_quantities_of_drivers_without_a_unit_have_the_unit_of_the_port():
     assert (per("µT", ""), per("µT", "°C"), per("counts", "A")) == ("µT", "µT/K", "counts/A")
 
 

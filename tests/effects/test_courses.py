@@ -18,19 +18,19 @@ CUBIC, UNKNOWN, COLUMN = EFFECTS["cubic_nonlinearity"], EFFECTS["unknown"], EFFE
 TIME = torch.linspace(7.0, 97.0, 901, dtype=torch.float64)
 
 
-def timed(time=TIME):
+def time_context(time=TIME):
     return Context(time, time.new_zeros(len(time), 0), (), time.new_zeros(len(time), 3), "µT", ("x", "y", "z"))
 
 
-def driven(values, unit):
+def driver_context(values, unit):
     values = torch.as_tensor(values, dtype=torch.float64)
     time = 0.1 * torch.arange(len(values), dtype=torch.float64)
     return Context(time, values.unsqueeze(-1), (unit,), values.new_zeros(len(values), 3), "µT", ("x", "y", "z"))
 
 
-def test_a_step_is_constant_from_its_onset_on():
+def test_a_step_is_constant_after_its_onset():
     gamma = torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64)
-    change = STEP.change(gamma, {"onset": 40.0}, timed())
+    change = STEP.change(gamma, {"onset": 40.0}, time_context())
     before = TIME < 40.0
     assert torch.equal(change[before], torch.zeros(int(before.sum()), 3, dtype=torch.float64))
     assert torch.equal(change[~before], gamma.expand(int((~before).sum()), 3))
@@ -49,7 +49,7 @@ DRIFTS = DRIFT.shapes(TIME)
 
 @pytest.mark.parametrize("shape", DRIFTS, ids=str)
 def test_a_drift_is_monotonic_from_0_to_1(shape):
-    course = DRIFT.waveform(shape, timed())
+    course = DRIFT.waveform(shape, time_context())
     assert float(course[0]) == pytest.approx(0.0, abs=1e-12)
     assert float(course[-1]) == pytest.approx(1.0, abs=1e-12)
     assert bool((course.diff() >= 0).all())
@@ -66,8 +66,8 @@ def test_drifts_equal_their_formulas():
     shapes = [{}, {"power": 0.5}, {"time_constant": 9.0}]
     for shape in shapes:
         assert shape in [{k: pytest.approx(v) for k, v in s.items()} for s in DRIFTS]
-        np.testing.assert_allclose(DRIFT.waveform(shape, timed()), expected[tuple(shape)], atol=1e-12)
-    middle = DRIFT.waveform({"middle": 45.0, "width": 4.5}, timed())
+        np.testing.assert_allclose(DRIFT.waveform(shape, time_context()), expected[tuple(shape)], atol=1e-12)
+    middle = DRIFT.waveform({"middle": 45.0, "width": 4.5}, time_context())
     assert float(middle[450]) == pytest.approx(0.5, abs=1e-9)
     logistic = 1.0 / (1.0 + np.exp(-(t - 45.0) / 4.5))
     np.testing.assert_allclose(np.corrcoef(middle, logistic)[0, 1], 1.0, rtol=1e-12)
@@ -84,20 +84,20 @@ def test_grid_has_drifts_of_every_kind():
 def test_lasting_change_is_the_offset_at_the_end(effect):
     gamma = torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64)
     shape = effect.shapes(TIME)[-1]
-    end = effect.change(gamma, shape, timed())[-1]
-    later = timed(torch.arange(5, dtype=torch.float64))
+    end = effect.change(gamma, shape, time_context())[-1]
+    later = time_context(torch.arange(5, dtype=torch.float64))
     torch.testing.assert_close(effect.lasting(gamma, later), end.expand(5, 3))
 
 
 @pytest.mark.parametrize(("effect", "unit"), [(CURRENT, "A"), (COLUMN, "V"), (TEMPERATURE, "°C")])
 def test_offsets_are_proportional_to_their_column(effect, unit):
-    context = driven([-2.0, 0.0, 3.0], unit)
+    context = driver_context([-2.0, 0.0, 3.0], unit)
     change = effect.change(torch.tensor([1.0, 0.0, -0.5], dtype=torch.float64), {}, context)
     assert change.tolist() == [[-2.0, 0.0, 1.0], [0.0, 0.0, 0.0], [3.0, 0.0, -1.5]]
 
 
 def test_temperature_offset_has_lag_and_curvature():
-    context = driven([0.0, 10.0, 10.0, -5.0], "°C")
+    context = driver_context([0.0, 10.0, 10.0, -5.0], "°C")
     shapes = TEMPERATURE.shapes(context.time)
     assert [dict(s) for s in shapes] == [{}, {"lag": 1.0}, {"lag": 5.0}, {"curvature": 0.02}, {"curvature": -0.02}]
     curved = TEMPERATURE.waveform({"curvature": 0.02}, context)
@@ -122,7 +122,7 @@ def test_unit_of_cubic_nonlinearity_follows_the_signal():
 
 
 def test_a_curve_is_a_legendre_series_in_its_own_range():
-    context = driven(np.linspace(-3.0, 5.0, 41), "V")
+    context = driver_context(np.linspace(-3.0, 5.0, 41), "V")
     gamma = torch.arange(9, dtype=torch.float64) - 4.0
     t = np.linspace(-1.0, 1.0, 41)
     expected = np.stack([legendre.legval(t, [0.0, *gamma.reshape(3, 3)[:, c].tolist()]) for c in range(3)], -1)
@@ -130,10 +130,10 @@ def test_a_curve_is_a_legendre_series_in_its_own_range():
 
 
 def test_a_curve_keeps_its_range_on_another_recording():
-    context = driven(np.linspace(-3.0, 5.0, 41), "V")
+    context = driver_context(np.linspace(-3.0, 5.0, 41), "V")
     gamma = torch.arange(9, dtype=torch.float64) - 4.0
     shape = UNKNOWN.bind({}, context)
     assert shape == {"low": -3.0, "high": 5.0}
     original = UNKNOWN.change(gamma, {}, context)
-    other = UNKNOWN.change(gamma, shape, driven([-9.0, -3.0, 1.0, 5.0, 9.0], "V"))
+    other = UNKNOWN.change(gamma, shape, driver_context([-9.0, -3.0, 1.0, 5.0, 9.0], "V"))
     torch.testing.assert_close(other, original[[0, 0, 20, 40, 40]])

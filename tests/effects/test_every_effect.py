@@ -40,7 +40,7 @@ class SupplyOffset(GainEffect):
         return context.drivers[:, 0]
 
 
-class Square(Effect):
+class EffectWithRequiredMethods(Effect):
     """An effect with the two required methods only."""
 
     id = "squared_response"
@@ -57,7 +57,7 @@ class Square(Effect):
         return gamma * context.signal.square()
 
 
-ALL = (*CATALOGUE, SupplyOffset(), Square())
+ALL = (*CATALOGUE, SupplyOffset(), EffectWithRequiredMethods())
 
 
 @over_all_cases(lambda: [pytest.param(effect, id=f"{type(effect).__name__}-{effect.plot_axis}") for effect in ALL])
@@ -148,7 +148,7 @@ def test_each_id_has_a_single_display_name():
     assert words_of("supply_offset") == SupplyOffset().display_name == "supply offset"
 
 
-def test_is_curve_by_id():
+def test_is_curve_is_determined_by_the_id():
     assert is_curve(Unrecorded.id)
     assert not is_curve("supply_offset")
     assert Unrecorded().is_curve

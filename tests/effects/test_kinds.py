@@ -25,7 +25,7 @@ STORE = {"time_constant": 7560.0}
 
 
 def at_state(effect, unit, name="x"):
-    """The context of an effect at the rate of a state in this unit."""
+    """Return the context of an effect at the rate of a state in this unit."""
     context = dynamic_context(effect)
     carries = tuple(name if carried == "speed" else carried for carried in context.carries)
     parts = {part: name if of == "speed" else of for part, of in context.parts.items() if part != "level"}

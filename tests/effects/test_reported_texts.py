@@ -48,7 +48,7 @@ def first_and_second_derivatives(gamma, degree, context):
 
 
 def evaluated(label, first, second):
-    """The value of a component's label, a formula in derivatives of the field."""
+    """Return the value of a component's label, a formula in derivatives of the field."""
     axes = {axis: k for k, axis in enumerate("xyz")}
 
     def derivative(of, by):

@@ -45,7 +45,7 @@ def test_a_user_effect_is_found_by_the_role_of_its_column(diagnosis):
     assert [(f.effect, f.drivers) for f in diagnosis.findings] == [("supply_offset", ("voltage",))]
 
 
-def test_the_unknown_curve_is_tried_on_the_column_too():
+def test_the_unknown_curve_is_tried_on_the_column_of_a_user_effect():
     """With a wrong formula of the user, the mismatch must not count as adequate."""
     prepared = Magnetometer().prepare(tumbling(600, noise=0.3, voltage=np.sin(np.arange(600) / 25.0)))
     effects = (*CATALOGUE, SupplyOffset())

@@ -17,7 +17,7 @@ def example():
     return module
 
 
-def test_mm_covers_under_outliers_that_least_squares_follows(example, capsys):
+def test_intervals_of_mm_cover_under_outliers_and_those_of_least_squares_do_not(example, capsys):
     sizes = ["--samples", "60", "--outliers", "0", "0.2", "--draws", "80"]
     example.main([*sizes, "--estimators", "least squares", "MM", "MM, homoscedastic"])
     rows = {
@@ -30,7 +30,7 @@ def test_mm_covers_under_outliers_that_least_squares_follows(example, capsys):
     assert rows["MM, homoscedastic"][1] < 90.0
 
 
-def test_errors_that_spread_with_the_regressor_are_covered_by_the_sandwich(example):
+def test_sandwich_intervals_cover_under_heteroscedastic_errors(example):
     sandwich, alike = (
         example.coverage(name, 150, 0.0, draws=150, seed=1, errors="spread") for name in ("MM", "MM, homoscedastic")
     )

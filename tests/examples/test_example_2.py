@@ -32,13 +32,13 @@ def test_mkc_em_is_within_two_standard_errors_of_its_limits_to_the_oracle(exampl
         assert float(ratio[case] - 2 * error[case]) <= limit, (case + 1, ratio, error)
 
 
-def test_the_algorithm_as_printed_finds_the_same_line(example):
+def test_the_published_algorithm_has_the_same_estimate(example):
     y = example.recordings(1, seed=3)[1, 0]
     fit = MKCRegression().fit(example.design(), y)
     assert abs(example.scipy_em(y.numpy()) - fit.coef_.numpy()).max() < 0.02
 
 
-def test_a_rough_fit_on_a_tight_domain_finds_the_head_under_outliers_on_one_side(example, monkeypatch):
+def test_a_first_fit_on_a_tight_domain_improves_estimates_under_one_sided_outliers(example, monkeypatch):
     X, Y = example.design(), example.recordings(400, seed=2)[5]
 
     def error():

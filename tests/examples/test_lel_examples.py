@@ -35,7 +35,7 @@ def assert_is_picture(path: Path) -> None:
     assert path.stat().st_size > 20_000
 
 
-def test_tables_1_to_4(monkeypatch, capsys):
+def test_tables_1_to_4_are_printed(monkeypatch, capsys):
     module = example("lel_tables_1_to_4")
     run(module, monkeypatch, "--draws", 6, "--samples", 2000, "--timed", 1)
     printed = capsys.readouterr().out
@@ -43,7 +43,7 @@ def test_tables_1_to_4(monkeypatch, capsys):
         assert text in printed
 
 
-def test_the_published_minima_of_case_2_and_every_draw_beats_least_squares():
+def test_case_2_has_the_published_minima_and_smaller_errors_than_least_squares():
     module = example("lel_tables_1_to_4")
     generator = torch.Generator().manual_seed(3)
     G = module.design(10_000)
@@ -71,7 +71,7 @@ def truth_of(module: ModuleType) -> torch.Tensor:
     return torch.tensor(module.TRUTH, dtype=torch.float64)
 
 
-def test_table_5(monkeypatch, capsys, tmp_path):
+def test_table_5_has_the_published_estimates_and_entropies(monkeypatch, capsys, tmp_path):
     module = example("lel_table_5")
     X, y = module.data()
     whole, target = hbk()
@@ -91,14 +91,14 @@ def test_table_5(monkeypatch, capsys, tmp_path):
 
 
 @pytest.mark.manual
-def test_figures(monkeypatch, capsys, tmp_path):
+def test_all_figures_are_drawn(monkeypatch, capsys, tmp_path):
     run(example("lel_figures"), monkeypatch, "--draws", 20, "--samples", 1000, "--output", tmp_path)
     assert "Figures 1 and 2" in capsys.readouterr().out
     for name in ("figures_1_2.png", "figures_3_to_8.png"):
         assert_is_picture(tmp_path / name)
 
 
-def test_range_image(monkeypatch, capsys, tmp_path):
+def test_lel_estimates_the_plane_of_a_range_image_better_than_least_squares(monkeypatch, capsys, tmp_path):
     module = example("lel_range_image")
     run(module, monkeypatch, "--output", tmp_path / "a.png")
     assert "pixels" in capsys.readouterr().out

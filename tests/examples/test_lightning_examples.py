@@ -20,7 +20,7 @@ pytestmark = [
 FOLDER = Path(__file__).parents[2] / "examples" / "lightning"
 
 
-def loaded(name):
+def load_example(name):
     spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     with pytest.MonkeyPatch.context() as patch:
@@ -33,18 +33,18 @@ def loaded(name):
 
 @pytest.fixture(scope="module")
 def example():
-    return loaded("heavy_tailed_channel")
+    return load_example("heavy_tailed_channel")
 
 
 @pytest.fixture(scope="module")
 def tabular():
     pytest.importorskip("sklearn")
-    return loaded("corrupted_tabular")
+    return load_example("corrupted_tabular")
 
 
 @pytest.fixture(scope="module")
 def series():
-    return loaded("bursty_series")
+    return load_example("bursty_series")
 
 
 def test_outliers_are_one_sided_and_in_one_channel(example):
@@ -56,15 +56,15 @@ def test_outliers_are_one_sided_and_in_one_channel(example):
 
 
 @pytest.mark.manual
-def test_mkc_em_is_closer_to_the_clean_function_than_the_squared_error_and_hubers(example):
+def test_mkc_em_has_a_smaller_error_than_squared_error_and_huber(example):
     error = {name: float(example.errors(example.trained(name, 0.25, 0, 8)).square().mean().sqrt())
              for name in ("MSE", "Huber", example.MKC_EM)}  # fmt: skip
     assert error[example.MKC_EM] < 0.3 * error["MSE"]
     assert error[example.MKC_EM] < 0.5 * error["Huber"]
 
 
-def test_peers_have_the_slopes_of_their_definitions():
-    adaptive = loaded("peers").AdaptiveLoss(1)
+def test_the_adaptive_loss_equals_its_definition():
+    adaptive = load_example("peers").AdaptiveLoss(1)
     z, item = torch.linspace(-3.0, 3.0, 7), torch.tensor(1.0)
     # the general loss at alpha = 1 is Charbonnier's, sqrt(z^2 + 1) - 1
     torch.testing.assert_close(adaptive.rho(z, item), (z.square() + 1.0).sqrt() - 1.0)
@@ -73,7 +73,7 @@ def test_peers_have_the_slopes_of_their_definitions():
 
 
 @pytest.mark.parametrize("name", ["diabetes", "Friedman 1"])
-def test_wrong_targets_are_two_to_ten_times_too_large_and_none_is_held_out(tabular, name):
+def test_wrong_targets_are_two_to_ten_times_too_large_in_training_only(tabular, name):
     draw = tabular.TASKS[name].draw
     bad, good = draw(0.2, 3), draw(0.0, 3)
     assert float(bad.wrong.double().mean()) == pytest.approx(0.2, abs=0.05)
@@ -86,7 +86,7 @@ def test_wrong_targets_are_two_to_ten_times_too_large_and_none_is_held_out(tabul
 
 @pytest.mark.manual
 @pytest.mark.parametrize(("name", "of_mse", "of_oracle"), [("diabetes", 0.6, 1.1), ("Friedman 1", 0.3, 1.3)])
-def test_mkc_em_does_on_corrupted_tables_nearly_as_well_as_without_the_wrong_rows(tabular, name, of_mse, of_oracle):
+def test_mkc_em_on_corrupted_tables_is_nearly_as_good_as_training_without_wrong_rows(tabular, name, of_mse, of_oracle):
     task = dataclasses.replace(tabular.TASKS[name], epochs=20)
     found = {n: tabular.outcome(task, n, 0.2, 3) for n in ("MSE", tabular.MKC_EM, tabular.ORACLE)}
     mkc = found[tabular.MKC_EM]
@@ -96,7 +96,7 @@ def test_mkc_em_does_on_corrupted_tables_nearly_as_well_as_without_the_wrong_row
     assert mkc.mistaken < 0.02
 
 
-def test_bursts_lift_a_share_of_the_series(series):
+def test_interference_is_a_share_of_the_series(series):
     training, held_out = series.sample(0.2, 3)
     for part, samples in ((training, series.TRAINING), (held_out, series.HELD_OUT)):
         assert part.clean.shape == (samples,)
@@ -106,14 +106,14 @@ def test_bursts_lift_a_share_of_the_series(series):
     assert not series.sample(0.0, 3)[0].interference.any()
 
 
-def test_targets_are_so_many_steps_after_their_windows(series):
+def test_targets_are_the_given_steps_after_their_windows(series):
     count = torch.arange(60.0)
     last = series.windows(count)[:, -1:]
     torch.testing.assert_close(series.ahead(count) - last, torch.tensor(series.AHEAD).expand(len(last), -1).float())
 
 
 @pytest.mark.manual
-def test_mkc_forecasts_the_series_better_than_the_squared_error_from_windows_of_either_kind(series):
+def test_mkc_forecasts_are_better_than_those_of_squared_error(series):
     every = {name: series.errors(series.trained(name, 0.2, 3, 4), 0.2, 3).square().mean(-1).sqrt()
              for name in ("MSE", series.MKC_EM, series.MKC_HEAD)}  # fmt: skip
     for name in (series.MKC_EM, series.MKC_HEAD):
@@ -122,7 +122,7 @@ def test_mkc_forecasts_the_series_better_than_the_squared_error_from_windows_of_
         assert disturbed < 0.9
 
 
-def test_heads_of_each_window_have_a_finite_loss(series):
+def test_heads_with_a_scale_for_each_window_have_a_finite_loss(series):
     x, y = torch.randn(5, series.WINDOW), torch.randn(5, len(series.AHEAD))
     for name in (series.MKC_HEAD, series.STUDENT_HEAD):
         net, criterion = series.network(name)
@@ -130,7 +130,7 @@ def test_heads_of_each_window_have_a_finite_loss(series):
         assert criterion(net(x), y).isfinite()
 
 
-def test_masked_squared_error_ignores_what_is_masked(series):
+def test_the_masked_squared_error_ignores_masked_targets(series):
     input = torch.tensor([1.0, 2.0, 3.0], requires_grad=True)
     value = series.MaskedMSE()(input, torch.tensor([0.0, torch.nan, 1.0]))
     value.backward()
@@ -138,8 +138,8 @@ def test_masked_squared_error_ignores_what_is_masked(series):
     torch.testing.assert_close(input.grad, torch.tensor([1.0, 0.0, 2.0]))
 
 
-def test_losses_are_timed_in_turns():
-    speed = loaded("speed")
+def test_every_loss_has_a_measured_time():
+    speed = load_example("speed")
     losses = {"squared": torch.nn.MSELoss(), "Gaussian": speed.LearnedGaussianNLL(4)}
     found = speed.measured(losses, rows=8, times=1, rounds=2, device=torch.device("cpu"))
     assert set(found) == set(losses)
@@ -149,11 +149,11 @@ def test_losses_are_timed_in_turns():
 @pytest.fixture(scope="module")
 def wrong_targets():
     pytest.importorskip("sklearn")
-    return loaded("wrong_targets")
+    return load_example("wrong_targets")
 
 
 @pytest.mark.parametrize("kind", ["permuted", "uniform", "one-sided", "factor 1000", "stuck"])
-def test_a_share_of_the_targets_is_wrong_and_no_other(wrong_targets, kind):
+def test_only_the_given_share_of_targets_is_wrong(wrong_targets, kind):
     target = torch.rand(200, 1, generator=torch.Generator().manual_seed(0)) + 1.0
     new, wrong = wrong_targets.contaminated(target, kind, 0.3, torch.Generator().manual_seed(1))
     assert int(wrong.sum()) == 60
@@ -164,7 +164,7 @@ def test_a_share_of_the_targets_is_wrong_and_no_other(wrong_targets, kind):
 
 
 @pytest.mark.manual
-def test_wrong_targets_leaves_no_row_out(wrong_targets, tmp_path):
+def test_the_table_of_wrong_targets_has_all_rows(wrong_targets, tmp_path):
     pytest.importorskip("matplotlib")
     arguments = ["--tables", "diabetes", "--shares", "0", "0.3", "--seeds", "1", "--steps", "120", "--no-cleaner"]
     wrong_targets.main([*arguments, "--workers", "1", "--output", str(tmp_path)])
@@ -178,7 +178,7 @@ def test_wrong_targets_leaves_no_row_out(wrong_targets, tmp_path):
     assert errors["MKC, as it comes"] < 1.2 < errors["MSE"]
 
 
-def test_an_error_of_a_cleaner_is_that_of_rows_held_out(wrong_targets):
+def test_a_cleaner_has_a_held_out_error(wrong_targets):
     pytest.importorskip("cleanlab")
     reported = wrong_targets.outcomes("diabetes", "one-sided", 0.2, 0, steps=100, cleaner=True)
     assert 0.3 < reported[wrong_targets.CLEANER].error < 5.0

@@ -15,12 +15,12 @@ from mkc_torch.recording.recording import write_table
 from tests.examples.test_lel_examples import FOLDER, assert_is_picture, example, run
 
 
-def test_figure_2_the_density_nears_the_gaussian():
+def test_figure_2_shows_a_density_that_converges_to_the_gaussian():
     module = example("figures_2_3")
     assert module.gap(100.0) < 1e-4 < module.gap(3.0)
 
 
-def test_figure_3_the_density_comes_within_hundredths_of_the_greatest_likelihood():
+def test_figure_3_shows_a_density_near_the_maximum_likelihood():
     module = example("figures_2_3")
     e = module.residuals(0.2, 50, 1000, torch.Generator().manual_seed(1))
     fit = module.fit_density(e, d=1.0, bound=module.BOUND_3)
@@ -28,7 +28,7 @@ def test_figure_3_the_density_comes_within_hundredths_of_the_greatest_likelihood
 
 
 @pytest.mark.manual
-def test_figures_4_to_6(monkeypatch, capsys, tmp_path):
+def test_figures_4_to_6_order_the_bandwidths_of_both_channels(monkeypatch, capsys, tmp_path):
     run(example("figures_4_to_6"), monkeypatch, "--draws", 8, "--output", tmp_path)
     printed = " ".join(capsys.readouterr().out.split())
     assert "σ of channel 1 is less than that of channel 2 in 8 of 8 draws" in printed
@@ -36,7 +36,7 @@ def test_figures_4_to_6(monkeypatch, capsys, tmp_path):
         assert_is_picture(tmp_path / name)
 
 
-def test_algorithm_3_is_at_rest_within_three_iterations_where_mkc_em_ends():
+def test_algorithm_3_converges_within_three_iterations_to_the_mkc_em_estimate():
     module = example("figures_4_to_6")
     X, Y = module.example_2(20, torch.Generator().manual_seed(2))
     path = module.algorithm_3(X, Y, 20.0, torch.tensor([1.0, 2.0]).double(), 8)
@@ -47,7 +47,7 @@ def test_algorithm_3_is_at_rest_within_three_iterations_where_mkc_em_ends():
 
 
 @pytest.mark.manual
-def test_the_error_over_the_bandwidth_falls_rises_and_ends_at_wls():
+def test_the_error_over_the_bandwidth_falls_and_then_rises_to_that_of_wls():
     module = example("figures_4_to_6")
     console = module.Console(quiet=True)
     _, curves = module.show_figure_4(console, 30, torch.Generator().manual_seed(0))
@@ -58,7 +58,7 @@ def test_the_error_over_the_bandwidth_falls_rises_and_ends_at_wls():
     assert float(curve[-1]) == pytest.approx(wls, rel=0.01)
 
 
-def test_error_bound(monkeypatch, capsys, tmp_path):
+def test_the_error_bound_holds_at_every_bandwidth(monkeypatch, capsys, tmp_path):
     run(example("error_bound"), monkeypatch, "--draws", 5, "--grid", 400, "--output", tmp_path / "a.png")
     printed = " ".join(capsys.readouterr().out.split())
     assert "the bound holds at every bandwidth" in printed
@@ -68,7 +68,7 @@ def test_error_bound(monkeypatch, capsys, tmp_path):
 
 
 @pytest.mark.manual
-def test_table_1(monkeypatch, capsys):
+def test_table_1_has_the_published_error_of_wls(monkeypatch, capsys):
     module = example("table_1")
     run(module, monkeypatch, "--draws", 20, "--timed", 1)
     printed = capsys.readouterr().out
@@ -80,7 +80,7 @@ def test_table_1(monkeypatch, capsys):
 
 @pytest.fixture
 def recordings(tmp_path) -> tuple[Path, Path]:
-    """A disturbed and an undisturbed recording of a simulated sensor."""
+    """Write a disturbed and an undisturbed recording of a simulated sensor."""
     g = torch.Generator().manual_seed(0)
     paths = tmp_path / "disturbed.csv", tmp_path / "undisturbed.csv"
     for path in paths:
@@ -98,7 +98,7 @@ def recordings(tmp_path) -> tuple[Path, Path]:
     return paths
 
 
-def test_figure_7(monkeypatch, capsys, tmp_path, recordings):
+def test_figure_7_has_a_small_error_of_mkc_em_on_a_disturbed_recording(monkeypatch, capsys, tmp_path, recordings):
     run(example("figure_7"), monkeypatch, *recordings, "--output", tmp_path / "a.png")
     printed = capsys.readouterr().out
     rows = {m[1]: float(m[2]) for m in re.finditer(r"│ ([\w-]+) +│ +([\d.]+) │", printed)}
@@ -107,7 +107,7 @@ def test_figure_7(monkeypatch, capsys, tmp_path, recordings):
 
 
 @pytest.mark.manual
-def test_comparison(monkeypatch, capsys, tmp_path):
+def test_the_comparison_prints_efficiencies_and_writes_a_page(monkeypatch, capsys, tmp_path):
     module = example("comparison")
     few = [e for e in module.ENTRIES if e.name.startswith(("LeastSquares", "MEstimator huber", "RANSAC", "MKC"))]
     monkeypatch.setattr(module, "ENTRIES", tuple(few))
@@ -152,7 +152,7 @@ def test_mkc_em_loses_less_than_one_per_cent_on_gaussian_data():
 
 
 @pytest.mark.manual
-def test_all_runs_scripts_and_links_what_they_left(monkeypatch, capsys, tmp_path):
+def test_all_runs_scripts_and_links_their_outputs(monkeypatch, capsys, tmp_path):
     module = example("all")
     run_all = ["all", "--output", str(tmp_path), "--small", "--only", "figures_2_3", "figure_7"]
     monkeypatch.setattr("sys.argv", run_all)
@@ -186,7 +186,7 @@ def test_all_has_every_script_of_the_papers():
         assert all("{" not in word for small in (True, False) for word in script.arguments(small, values))
 
 
-def test_table_2_on_a_simulated_sensor(monkeypatch, capsys):
+def test_table_2_has_a_smaller_offset_error_of_mkc_em_on_a_simulated_sensor(monkeypatch, capsys):
     run(example("table_2"), monkeypatch)
     rows = {
         line.split("│")[1].strip(): line.split("│")[3] for line in capsys.readouterr().out.splitlines() if "│" in line

@@ -33,7 +33,7 @@ def test_the_share_of_wrong_labels_is_the_requested_share(example):
     assert torch.equal(example.digits(0.0, seed=1).given, data.true)
 
 
-def test_peers_are_their_definitions(example):
+def test_peer_losses_equal_their_definitions(example):
     logits, labels = torch.randn(6, 10, generator=torch.Generator().manual_seed(0)), torch.arange(6)
     error = torch.nn.functional.one_hot(labels, 10) - logits.softmax(1)
     torch.testing.assert_close(example.MeanAbsoluteError()(logits, labels), error.abs().sum(1).mean())
@@ -42,7 +42,7 @@ def test_peers_are_their_definitions(example):
 
 
 @pytest.mark.manual
-def test_the_graduated_loss_does_not_memorise_and_names_the_wrong_labels(example):
+def test_the_graduated_loss_does_not_memorise_and_identifies_wrong_labels(example):
     data = example.digits(0.6, seed=0)
     module, reference = (example.trained(name, data, 0, 30) for name in (example.GRADUATED, example.CROSS_ENTROPY))
     assert len(module.history) == 30
@@ -54,7 +54,7 @@ def test_the_graduated_loss_does_not_memorise_and_names_the_wrong_labels(example
 
 
 @pytest.mark.manual
-def test_table_and_picture(example, monkeypatch, capsys, tmp_path):
+def test_the_table_and_the_picture_have_all_losses(example, monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(example, "SHARES", (0.0, example.SHOWN))
     found = example.table(seeds=1, epochs=1)
     example.picture(tmp_path / "picture.png", found)

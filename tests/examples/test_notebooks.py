@@ -1,4 +1,4 @@
-"""The notebooks run as they stand, on simulated recordings, and are kept without what a machine printed."""
+"""The notebooks run on simulated recordings, and are stored without outputs."""
 
 import json
 import re
@@ -10,12 +10,12 @@ NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "examples" / "notebook
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 
-def test_there_is_one_for_each_kind_of_user():
+def test_there_are_notebooks_for_networks_sensors_and_simulations():
     assert [path.stem for path in NOTEBOOKS] == ["network", "sensor", "simulation"]
 
 
 @each_notebook
-def test_nothing_of_a_run_is_kept(path):
+def test_notebooks_are_stored_without_outputs_and_local_paths(path):
     text = path.read_text(encoding="utf-8")
     content = json.loads(text)
     for cell in content["cells"]:
@@ -28,7 +28,7 @@ def test_nothing_of_a_run_is_kept(path):
 @pytest.mark.manual
 @each_notebook
 def test_every_cell_runs(path, tmp_path, monkeypatch):
-    """As plain Python in this process, which spares a kernel; what the cells assert is asserted."""
+    """The cells run as plain Python in this process, with their assertions, without a kernel."""
     pyplot = pytest.importorskip("matplotlib.pyplot")
     monkeypatch.chdir(tmp_path)
     names = {"__name__": path.stem}

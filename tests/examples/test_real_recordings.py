@@ -29,7 +29,7 @@ def test_the_true_attitude_shows_the_published_step(example, number, step):
 
 
 @pytest.mark.manual
-def test_what_is_found_is_printed_and_drawn(example, monkeypatch, tmp_path, capsys):
+def test_findings_are_printed_and_drawn(example, monkeypatch, tmp_path, capsys):
     case = example.CASES[0]
     folder = shared_data(f"magnetometer/{case.name}.csv").parent
     monkeypatch.setattr(example, "CASES", (case,))
@@ -42,7 +42,7 @@ def test_what_is_found_is_printed_and_drawn(example, monkeypatch, tmp_path, caps
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
-def test_from_the_length_alone_nothing_else_helps(example):
+def test_the_recording_of_a_case_has_the_magnetometer_only(example):
     case = example.CASES[0]
     folder = shared_data(f"magnetometer/{case.name}.csv").parent
     assert set(case.recording(folder).columns) == {"time", "mag_x", "mag_y", "mag_z"}

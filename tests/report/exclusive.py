@@ -1,4 +1,4 @@
-"""Statements of a report that exclude each other: a pair is a line of ``PAIRS``, what numbers rule out of ``RULES``."""
+"""Statements of a report that exclude each other: ``PAIRS`` of texts, and ``RULES`` on the numbers."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def _advised(d: Diagnosis, start: str) -> list[str]:
 
 
 def _claimed_and_refused(d: Diagnosis) -> bool:
-    """The advice is to correct for an effect and not to correct for it."""
+    """Whether the advice is both to correct and not to correct for an effect."""
     use = " ".join(_advised(d, "The model found here corrects for")).partition(":")[0]
     corrected = set(re.split(" and | for ", use)[1:])
     refused = [re.sub(r"(Do not correct for|Do not add) (.*?)( yet| to the simulation|, unless|: ).*", r"\2", item)
@@ -139,7 +139,7 @@ def _claimed_and_refused(d: Diagnosis) -> bool:
 
 
 def _two_residuals(d: Diagnosis) -> bool:
-    """The table of held-out blocks and the first finding give different residuals of the baseline."""
+    """Whether the held-out table and the first finding have different residuals of the baseline."""
     held = d.findings[0].held_out if d.findings else None
     if held is None or held.outputs or len(d.traces.channels) > 1 or not math.isfinite(d.baseline.rmse):
         return False
@@ -151,20 +151,20 @@ RULES: dict[str, Rule] = {
     "an interval that ends before it begins": lambda d: any(a > b for f in d.findings for a, b in f.intervals),
     "a claim whose size is 0 within its error": lambda d: any(is_zero_within_error(f) for f in _claims(d)),
     "a claim above the level": lambda d: any(f.p_value > d.level for f in _claims(d)),
-    "a claim that is worse in the free run": lambda d: any(
+    "a claim that is worse in open loop": lambda d: any(
         f.held_out is not None
         and not f.held_out.decides
         and f.held_out.rmse_after > 1.05 * f.held_out.rmse_before
         and not f.held_out.outputs
         for f in _claims(d)
     ),
-    "left out, and no form of the recording's": lambda d: any(
+    "left out, and of another shape": lambda d: any(
         f.shape is not None and f.shape.curve is not None for f in _claims(d)
     ),
     "adequate with a finding": lambda d: d.verdict == "adequate" and bool(d.findings),
     "adequate with process noise": lambda d: d.verdict == "adequate" and bool(d.environment.process_noise),
     "adequate with an estimated disturbance": lambda d: d.verdict == "adequate" and bool(d.environment.disturbance),
-    "adequate with what remains": lambda d: d.verdict == "adequate" and bool(d.remaining),
+    "adequate with a remaining trend": lambda d: d.verdict == "adequate" and bool(d.remaining),
     "adequate with a warning of a disturbance": lambda d: (
         d.verdict == "adequate"
         and any(
@@ -172,32 +172,30 @@ RULES: dict[str, Rule] = {
         )
     ),
     "explained without a claim": lambda d: d.verdict == "explained" and not _claims(d),
-    "explained with a finding that is no claim": lambda d: (
-        d.verdict == "explained" and len(_claims(d)) < len(d.findings)
-    ),
+    "explained with an unconfirmed finding": lambda d: d.verdict == "explained" and len(_claims(d)) < len(d.findings),
     "explained with process noise of a rate": lambda d: (
         d.verdict == "explained" and any(p.at_rate for p in d.environment.process_noise)
     ),
     "unfit with a finding": lambda d: d.verdict == "unfit" and bool(d.findings),
-    "unfit where every output is followed": lambda d: (
+    "unfit although every output is explained": lambda d: (
         d.verdict == "unfit"
         and bool(d.environment.goodness_of_fit)
         and all(fit.explained > 0.9 for fit in d.environment.goodness_of_fit)
     ),
-    "reasons why it does not follow where it does": lambda d: d.verdict != "unfit" and bool(d.environment.reasons),
+    "reasons for a poor fit although the fit is good": lambda d: d.verdict != "unfit" and bool(d.environment.reasons),
     "to be corrected and not to be": _claimed_and_refused,
-    "a model to apply that nothing is worth": lambda d: (
+    "a model to apply without a transferable finding": lambda d: (
         bool(_advised(d, "The model found here")) and not any(transfers(f) for f in d.findings)
     ),
     "not plausible, and to be corrected": lambda d: any(transfers(f) and not f.plausible for f in d.findings),
-    "indistinguishable from itself": lambda d: any(
+    "a finding among its own alternatives": lambda d: any(
         (a.effect, a.drivers, a.port) == (f.effect, f.drivers, "") for f in d.findings for a in f.alternatives
     ),
     "two residuals of the simulation without findings": _two_residuals,
-    "shares of runs that are no shares": lambda d: any(
+    "shares of runs that do not sum to 1": lambda d: any(
         f.experiments and not math.isclose(sum(f.experiments), 1.0, abs_tol=0.02) for f in d.findings
     ),
-    "a floor above what is left by far, and adequate": lambda d: (
+    "adequate with a residual far above the noise floor": lambda d: (
         d.verdict == "adequate" and any(fit.residual > 3.0 * fit.noise_floor for fit in d.environment.goodness_of_fit)
     ),
     "worth correcting in an unfit simulation": lambda d: (
@@ -244,7 +242,7 @@ def _in_text(rows: Sequence[str], d: Diagnosis) -> Iterator[str]:
 
 
 def _sections(rows: Sequence[str]) -> list[str]:
-    """The text on each of several findings, which begins with a number."""
+    """Return the text on each of several findings, which starts with a number."""
     end = next((k for k, row in enumerate(rows) if re.match("[Tt]ogether", row)), None)
     rows = [*rows[:end], *([] if end is None else rows[end + 1 :])]
     begins = [k for k, row in enumerate(rows) if re.match(r"\d+( ·|  )", row)]
@@ -252,7 +250,7 @@ def _sections(rows: Sequence[str]) -> list[str]:
 
 
 def terminal_rows(diagnosis: Diagnosis) -> list[str]:
-    """The summary on a wide terminal, one row per label; continuation lines belong to their label's row."""
+    """Return the summary on a wide terminal, a row per label with its continuation lines."""
     out = io.StringIO()
     show(Console(file=out, width=4000, color_system=None), diagnosis, [])
     rows: list[str] = []
@@ -265,7 +263,7 @@ def terminal_rows(diagnosis: Diagnosis) -> list[str]:
 
 
 def box_rows(diagnosis: Diagnosis) -> list[str]:
-    """The box at the top of a page, with what to do and the warnings."""
+    """Return the rows of the box at the top of a page, of the advice and of the warnings."""
     rows = [headline(diagnosis), *(f"{question} {' '.join(lines)}" for question, lines in summary(diagnosis))]
     return [row.replace("`", "") for row in [*rows, *to_do(diagnosis), *warned(diagnosis)]]
 
@@ -297,7 +295,7 @@ class _Rows(HTMLParser):
 
 
 def page_rows(page: str) -> list[str]:
-    """The text of a page, one item per table row, paragraph or heading."""
+    """Return the text of a page, one item per table row, paragraph or heading."""
     parser = _Rows()
     parser.feed(page)
     return [text for row in parser.rows if (text := " ".join(row.replace("\u00a0", " ").split()))]

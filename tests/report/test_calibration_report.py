@@ -46,7 +46,7 @@ class Tags(HTMLParser):
         self.display_name.append(data)
 
 
-def parsed(page):
+def parse_page(page):
     tags = Tags()
     tags.feed(page)
     assert tags.open == []
@@ -54,7 +54,7 @@ def parsed(page):
 
 
 def text_of(page):
-    return " ".join(" ".join(parsed(page).display_name).split())
+    return " ".join(" ".join(parse_page(page).display_name).split())
 
 
 @pytest.fixture(scope="module")
@@ -73,14 +73,14 @@ def page(calibration, recording):
     return calibration_report(calibration, recording, note="SIMULATED data", comparison=[row])
 
 
-def test_page_is_well_formed_with_four_pictures_and_unique_ids(page):
-    tags = parsed(page)
+def test_the_page_is_well_formed_with_pictures_and_unique_ids(page):
+    tags = parse_page(page)
     assert page.count("<figure") == 4
     assert page.count("<svg ") == 6 + 2 + 2 + 1  # a panel each
     assert len(tags.ids) == len(set(tags.ids))
 
 
-def test_page_loads_nothing(page):
+def test_the_page_loads_nothing(page):
     assert "<script" not in page
     assert "@import" not in page
     sources = re.findall(r'(?:href|src)="([^"]*)"', page) + re.findall(r"url\(([^)]*)\)", page)
@@ -89,12 +89,12 @@ def test_page_loads_nothing(page):
 
 
 def test_references_inside_the_pictures_resolve(page):
-    ids = set(parsed(page).ids)
+    ids = set(parse_page(page).ids)
     for target in re.findall(r'href="#([^"]*)"', page) + re.findall(r"url\(#([^)]*)\)", page):
         assert target in ids
 
 
-def test_page_begins_with_the_result_in_plain_words(page):
+def test_the_page_starts_with_result_note_and_comparison(page):
     text = text_of(page)
     assert "most samples were rejected there. Offset (11.9" in text
     assert "samples were rejected, mainly between 3" in text
@@ -110,7 +110,7 @@ def test_the_headline_marks_doubtful_results():
     assert "Calibrated, but read the warnings." in text_of(calibration_report(calibrate(doubtful), doubtful))
 
 
-def test_python_code_of_the_page_corrects(calibration, recording):
+def test_the_python_code_equals_the_calibration(calibration, recording):
     measured = recording.magnetometer().numpy()
     names = {"measured": measured}
     exec(wording.python_code(calibration), names)
@@ -118,7 +118,7 @@ def test_python_code_of_the_page_corrects(calibration, recording):
     torch.testing.assert_close(torch.from_numpy(names["field"]), expected, rtol=1e-6, atol=1e-5)
 
 
-def test_c_code_holds_float_literals(calibration):
+def test_the_c_code_has_float_literals(calibration):
     whole = dataclasses.replace(calibration, center=(1.0, 2.5e-7, -3.0))
     assert "{1.0f, 2.5e-07f, -3.0f}" in wording.c_code(whole)
 
@@ -132,7 +132,7 @@ def test_names_and_warnings_are_escaped(calibration, recording):
 
 
 @pytest.mark.e2e
-def test_units_other_than_microtesla():
+def test_a_page_has_the_units_of_the_recording():
     points = noisy_ellipsoid()
     columns = dict(zip(("mag_x", "mag_y", "mag_z"), (20 * points).unbind(-1), strict=True))
     counts = Recording(columns, units=dict.fromkeys(columns, "counts"))
@@ -146,7 +146,7 @@ def test_units_other_than_microtesla():
 @pytest.mark.e2e
 @pytest.mark.parametrize("factor", [1e-30, 1e-6, 1e6, 1e30])
 @pytest.mark.parametrize("noise", [0.0, 0.3])
-def test_a_recording_of_any_size_has_a_page(factor, noise):
+def test_recordings_of_extreme_scales_have_a_page_without_nan(factor, noise):
     huge = recorded(factor * noisy_ellipsoid(noise=noise))
     text = text_of(calibration_report(calibrate(huge), huge))
     assert "recorded units" in text
@@ -161,12 +161,12 @@ def test_small_and_exact_recordings_have_a_page(count):
 
 
 @pytest.mark.e2e
-def test_recording_without_time_has_samples_on_the_axis():
+def test_a_recording_without_time_has_a_page():
     plain = recorded(noisy_ellipsoid(100))
     assert "Calibrated." in text_of(calibration_report(calibrate(plain), plain))
 
 
-def test_refusal_names_the_directions_and_the_motion():
+def test_the_refusal_page_names_the_missing_directions_and_the_motion():
     points = noisy_ellipsoid(600)
     cap = recorded(points[points[:, 2] < -10.0])
     with pytest.raises(NotIdentifiableError) as refused:
@@ -180,7 +180,7 @@ def test_refusal_names_the_directions_and_the_motion():
     assert shown.count("<svg ") == 1
 
 
-def test_refusal_without_any_direction_has_no_map():
+def test_the_refusal_page_of_a_sensor_at_rest_has_no_map():
     still = recorded(torch.ones(50, 3, dtype=torch.float64))
     with pytest.raises(NotIdentifiableError) as refused:
         calibrate(still)
@@ -188,7 +188,7 @@ def test_refusal_without_any_direction_has_no_map():
 
 
 @pytest.mark.e2e
-def test_pages_leave_the_settings_of_matplotlib_alone(calibration, recording):
+def test_a_page_does_not_change_the_settings_of_matplotlib(calibration, recording):
     import matplotlib
 
     before = dict(matplotlib.rcParams)
@@ -219,7 +219,7 @@ def test_the_noise_is_in_the_units_of_the_recording(calibration, page):
 
 
 @pytest.mark.e2e
-def test_the_heavy_tail_test_alone_decides_whether_the_noise_is_called_gaussian(calibration, recording):
+def test_only_the_heavy_tail_test_decides_whether_the_noise_is_gaussian(calibration, recording):
     heavy = dataclasses.replace(calibration, tails=ChannelTails(31.5, 0.041, 0.006))
     share = "heavy-tailed: 4.1 ± 0.6 % of the residuals beyond three times that (0.27 % if Gaussian)"
     assert wording.noise(heavy).endswith(share)
@@ -231,7 +231,7 @@ def test_the_heavy_tail_test_alone_decides_whether_the_noise_is_called_gaussian(
 
 
 @pytest.mark.e2e
-def test_backticks_are_set_as_code(calibration, recording):
+def test_text_in_backticks_is_code(calibration, recording):
     shown = dataclasses.replace(calibration, warnings=("run `mkc <x>` & so on", "one ` alone"))
     html = calibration_report(shown, recording)
     assert "run <code>mkc &lt;x&gt;</code> &amp; so on" in html
@@ -249,7 +249,7 @@ def test_warnings_about_the_file_do_not_make_the_result_doubtful(recording):
 
 
 @pytest.mark.e2e
-def test_many_rejected_samples_lead_to_the_diagnosis():
+def test_the_page_of_many_rejected_samples_has_the_command_of_the_diagnosis():
     points = noisy_ellipsoid()
     points[:120] += torch.tensor([0.0, 0.0, 60.0])
     doubtful = recorded(points)
@@ -258,7 +258,7 @@ def test_many_rejected_samples_lead_to_the_diagnosis():
     )
 
 
-def test_a_refusal_reports_the_value_that_was_left_out():
+def test_the_refusal_page_reports_excluded_values():
     points = noisy_ellipsoid(600)
     cap = points[points[:, 2] < -10.0]
     cap[3, 0] = 1e9
@@ -268,7 +268,7 @@ def test_a_refusal_reports_the_value_that_was_left_out():
     assert "mag_x is 1e+09" in text_of(refusal_report(refused_one, refused.value))
 
 
-def test_sizes_read_well():
+def test_sizes_are_rounded_to_three_digits():
     assert wording.size(1234.5) == "1234"
     assert wording.size(1e-9) == "1.00e-09"
     assert wording.size(math.inf) == "inf"
@@ -276,8 +276,8 @@ def test_sizes_read_well():
 
 
 @pytest.mark.parametrize("times", [1.0, 3000.0])
-def test_no_text_of_a_picture_is_cut_at_its_edge_or_covers_another_panel(recording, monkeypatch, times):
-    """Of counts with six digits too."""
+def test_texts_of_pictures_are_inside_the_picture_and_do_not_overlap(recording, monkeypatch, times):
+    """Also for counts of six digits."""
     columns = {name: values * (times if name.startswith("mag") else 1.0) for name, values in recording.columns.items()}
     counts = Recording(columns, units=dict.fromkeys(("mag_x", "mag_y", "mag_z"), "counts"))
     figures = []
@@ -297,7 +297,7 @@ def test_no_text_of_a_picture_is_cut_at_its_edge_or_covers_another_panel(recordi
 
 
 def _texts(ax):
-    """The boxes, in pixels, of labels and titles that are shown of a panel."""
+    """Return the boxes, in pixels, of the visible labels and titles of a panel."""
     low, high = sorted(ax.get_xlim())
     ticks = [label for label in ax.get_xticklabels() if low <= label.get_position()[0] <= high]
     low, high = sorted(ax.get_ylim())

@@ -17,18 +17,18 @@ from mkc_torch.report.diagnosis import environment, unseen
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.page import diagnosis_report
 from tests.diagnosis.factory import (
-    LOST,
+    POOR_FITS,
     PROCESS_NOISE,
     graded,
     make_diagnosis,
+    make_disturbance,
     make_environment,
-    make_follows,
-    make_forcing,
+    make_goodness_of_fit,
     make_unfit,
-    nearest,
+    with_another_shape,
     with_evidence,
 )
-from tests.report.test_calibration_report import parsed, text_of
+from tests.report.test_calibration_report import parse_page, text_of
 
 
 def disturbed(**changes):
@@ -48,13 +48,13 @@ def with_first(diagnosis, change):
 
 
 def box_of(page):
-    """The text of the box at the top."""
+    """Return the text of the box at the top."""
     text = text_of(page[page.index('<div class="top') : page.index("</table>")] + "</table></div>")
     return re.sub(" ([.,:])", r"\1", text)  # after code
 
 
 def test_the_box_has_the_goodness_of_fit_of_each_output_in_its_unit():
-    followed = (make_follows(), make_follows("rate", "rad/s", 0.031, 1.4, 0.02, floor_source="samples"))
+    followed = (make_goodness_of_fit(), make_goodness_of_fit("rate", "rad/s", 0.031, 1.4, 0.02, floor_source="samples"))
     quiet = make_diagnosis(
         0, samples=200, environment=make_environment(goodness_of_fit=followed, process_noise=(), disturbance=())
     )
@@ -68,16 +68,17 @@ def test_the_box_has_the_goodness_of_fit_of_each_output_in_its_unit():
     assert '<h1 class="good">' in page
 
 
-def test_an_output_that_hardly_varies_has_no_explained_share():
-    still = make_follows(residual=0.0051, variation=0.006, explained=0.2)
+def test_an_output_of_small_variation_has_no_explained_share():
+    still = make_goodness_of_fit(residual=0.0051, variation=0.006, explained=0.2)
     (line,) = environment.output_lines(
         make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=(still,)))
     )
-    assert line == ("angle: residual 0.00510 rad; noise floor 0.00500 rad (declared); the output hardly varies")
+    assert line.startswith("angle: residual 0.00510 rad; noise floor 0.00500 rad (declared)")
+    assert "explains" not in line
 
 
 def test_the_table_has_all_of_many_outputs():
-    many = tuple(make_follows(f"motor_{i}", "rad/s", rmse_of_last_value=math.nan) for i in range(9))
+    many = tuple(make_goodness_of_fit(f"motor_{i}", "rad/s", rmse_of_last_value=math.nan) for i in range(9))
     page = diagnosis_report(
         make_diagnosis(
             0, samples=100, environment=make_environment(goodness_of_fit=many, process_noise=(), disturbance=())
@@ -87,7 +88,7 @@ def test_the_table_has_all_of_many_outputs():
     assert "motor_8 0.00490 rad/s 0.00500 rad/s (declared) 0.350 rad/s 99.98 % 0.350 rad/s unknown" in text_of(page)
 
 
-def test_a_simulation_that_does_not_fit_is_reported_first():
+def test_the_page_of_a_poor_fit_starts_with_it_and_names_no_physics():
     page = diagnosis_report(make_unfit())
     box = box_of(page)
     assert box.startswith("The simulation does not fit the recording.")
@@ -102,16 +103,16 @@ def test_a_simulation_that_does_not_fit_is_reported_first():
         assert words not in text
 
 
-def test_one_colour_for_adequate_another_for_unfit_and_unexplained():
+def test_the_status_is_good_if_adequate_and_open_if_unfit_or_unexplained():
     quiet = make_diagnosis(0, samples=50, environment=make_environment(process_noise=(), disturbance=()))
     assert [top.tone(d) for d in (quiet, make_unfit(), disturbed(), make_diagnosis(1, samples=50))] == [
         "good", "open", "open", "found",
     ]  # fmt: skip
 
 
-def test_the_disturbance_is_the_first_picture_and_is_described_in_plain_words():
+def test_the_disturbance_is_the_first_picture_with_size_and_correlation_time():
     page = diagnosis_report(disturbed())
-    parsed(page)
+    parse_page(page)
     assert page.index("Disturbance over time, and") < page.index("Residual over time before and after")
     box = box_of(page)
     assert box.startswith("Process noise acts on the rate of rate, and no physics in the catalogue explains it.")
@@ -130,15 +131,15 @@ def test_the_disturbance_is_the_first_picture_and_is_described_in_plain_words():
 
 @pytest.mark.parametrize("samples", [1, 2, 5000])
 @pytest.mark.parametrize("curves", [0, 1, 12])
-def test_a_forcing_of_any_length_with_any_number_of_curves(samples, curves):
-    forcing = make_forcing(samples)
+def test_disturbances_of_any_length_and_number_of_curves_have_a_page(samples, curves):
+    forcing = make_disturbance(samples)
     forcing = dataclasses.replace(forcing, curves=tuple(forcing.curves[i % 3] for i in range(curves)))
     page = diagnosis_report(disturbed(disturbance=(forcing,)))
     assert page.count("<figure") == 2
     assert len(page) < 500_000
 
 
-def test_runs_are_not_joined_by_a_line():
+def test_lines_of_pictures_are_interrupted_between_runs():
     from mkc_torch.diagnosis.plot.drawings import _joined
 
     time = torch.cat([torch.arange(5.0), torch.arange(5.0)]).numpy()
@@ -150,7 +151,7 @@ def test_drift_of_a_sensor_is_reported_as_drift():
     slow = dataclasses.replace(
         PROCESS_NOISE, place="angle", at_rate=False, unit="rad", size=0.012, standard_error=0.002
     )
-    text = text_of(diagnosis_report(disturbed(process_noise=(slow,), disturbance=(make_forcing(200, slow),))))
+    text = text_of(diagnosis_report(disturbed(process_noise=(slow,), disturbance=(make_disturbance(200, slow),))))
     assert "A drift of angle adds to the sensor's noise, and no physics" in text
     assert "Drift of angle in addition to its white noise: 0.0120 ± 0.0020 rad, correlation time 0.7 s." in text
     assert "Drift of angle" in text
@@ -159,7 +160,7 @@ def test_drift_of_a_sensor_is_reported_as_drift():
 def test_two_drifts_of_an_output_share_a_sentence_and_have_numbered_headings():
     slow = dataclasses.replace(PROCESS_NOISE, place="angle", at_rate=False, unit="rad", correlation_time=29.0)
     fast = dataclasses.replace(slow, correlation_time=1.5)
-    drifts = tuple(make_forcing(200, process) for process in (slow, fast))
+    drifts = tuple(make_disturbance(200, process) for process in (slow, fast))
     text = text_of(diagnosis_report(disturbed(process_noise=(slow, fast), disturbance=drifts)))
     assert text.count("in addition to its white noise") == 1
     assert "correlation time 29 s; and" in text
@@ -167,20 +168,20 @@ def test_two_drifts_of_an_output_share_a_sentence_and_have_numbered_headings():
     assert "Drift of angle , part 2 of 2" in text
 
 
-def test_a_shape_that_is_kept_at_a_small_p_value_has_a_reason():
+def test_a_form_that_is_kept_at_a_small_p_value_has_a_reason():
     kept = ShapeCheck(5.2, 0.0055)
     made = with_first(make_diagnosis(1, samples=200), lambda finding: dataclasses.replace(finding, shape=kept))
     text = text_of(diagnosis_report(made))
     assert "gains only 5.20 nats (p = 0.0055 if the name is right): the name is kept" in text
 
 
-def test_an_effect_of_the_wrong_shape_is_only_nearest_and_its_curve_is_drawn():
-    made = with_first(make_diagnosis(1, samples=200, verdict="unexplained"), nearest)
+def test_an_effect_of_another_shape_is_nearest_and_its_free_curve_is_shown():
+    made = with_first(make_diagnosis(1, samples=200, verdict="unexplained"), with_another_shape)
     page = diagnosis_report(made)
-    assert top.headline(made) == (
-        "The residual has structure that no effect in the catalogue explains. Nearest in the catalogue: hard-iron step "
-        "(a free curve of the same variables gains 163 nats)."
-    )
+    headline = top.headline(made)
+    assert headline.startswith("The residual has structure that no effect in the catalogue explains")
+    assert "Nearest in the catalogue: hard-iron step (a free curve" in headline
+    assert "163 nats" in headline
     text = text_of(page)
     assert "Left out" not in text
     assert "Nearest in the catalogue: hard-iron step" in text
@@ -188,10 +189,10 @@ def test_an_effect_of_the_wrong_shape_is_only_nearest_and_its_curve_is_drawn():
     assert "Nearest formula: 0.0071 |x|^1.52 sign(x) ." in text
     assert "gains 163 nats (p = 0.002 if the name is right)" in text
     assert page.index("Free curve and the shape of finding 1") < page.index("Curve of finding 1, and")
-    parsed(page)
+    parse_page(page)
     # of another driver than the named form: the free curve alone
     curve = dataclasses.replace(made.findings[0].curve, driver="difference")
-    alone = with_first(made, lambda f: nearest(f, curve=curve, formula=""))
+    alone = with_first(made, lambda f: with_another_shape(f, curve=curve, formula=""))
     assert "Free curve, 95 % band" in text_of(diagnosis_report(alone))
 
 
@@ -203,7 +204,7 @@ def test_an_effect_of_the_wrong_shape_is_only_nearest_and_its_curve_is_drawn():
         ("unconfirmed", "Found, but not confirmed on held-out blocks: hard-iron step"),
     ],
 )
-def test_the_grade_alone_decides_the_headline(grade, text):
+def test_the_headline_depends_on_the_grade_only(grade, text):
     made = with_first(make_diagnosis(1, samples=50), lambda f: graded(f, grade))
     assert top.headline(made).startswith(text)
 
@@ -212,10 +213,10 @@ def test_small_findings_of_an_adequate_simulation_are_in_the_headline():
     small = with_first(make_diagnosis(1, samples=50, verdict="adequate"), lambda f: graded(f, "small"))
     assert top.headline(small).startswith("No missing physics is worth correcting. Real, but small")
     weak = with_first(small, lambda f: graded(f, "unconfirmed"))
-    assert top.headline(weak) == "The recording shows no missing physics."
+    assert "no missing physics" in top.headline(weak)
 
 
-def test_smaller_and_not_shown_to_be_better_never_stand_together_without_the_reason():
+def test_contrary_changes_of_likelihood_and_residual_have_a_reason():
     diverged = {"diverged_blocks": (DivergedBlock(3, before=True, after=False),), "blocks": 25}
     for held, reason in (
         (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m"), "the gain varies between blocks by more than its mean"),
@@ -259,12 +260,12 @@ def test_each_output_has_its_own_residual_sizes_and_noise_floor():
         assert "rate 0.300 → 0.100 rad/s (67 % less)" in text
         assert "15671" not in text
         assert "n 1 of 25 blocks without the finding" in text
-    # without sizes of each output there is no size of all outputs together
+    # without sizes of each output there is no joint size
     bare = dataclasses.replace(made, findings=tuple(dataclasses.replace(f, evidence=()) for f in made.findings))
     assert unseen.residual_of_all(bare) == []
 
 
-def test_the_box_has_what_where_how_large_and_how_sure_of_each_of_several():
+def test_the_box_has_effect_time_size_and_evidence_of_each_finding():
     box = box_of(diagnosis_report(make_diagnosis(3, samples=4500)))
     for words in (
         "1 · Hard-iron step Left out of the simulation; not distinguished from: current field (current).",
@@ -276,14 +277,14 @@ def test_the_box_has_what_where_how_large_and_how_sure_of_each_of_several():
         assert words in box
 
 
-def test_warnings_come_after_the_findings_and_those_of_a_finding_first():
+def test_warnings_follow_the_findings_and_start_with_those_of_findings():
     made = make_diagnosis(1, samples=200, warnings=("A column is empty.", "hard_iron_step may be a door."))
     page = diagnosis_report(made)
     assert top.warned(made) == ["Hard-iron step may be a door.", "A column is empty."]
     assert page.index("Alternatives") < page.index("may be a door") < page.index("Statistics</h2>")
 
 
-def test_the_statisticians_numbers_are_one_click_below():
+def test_statistics_are_in_closed_details():
     page = diagnosis_report(disturbed(process_noise=(PROCESS_NOISE,)))
     closed = re.findall(r"<details><summary>([^<]*)</summary>", page)
     assert closed[:4] == [
@@ -294,7 +295,9 @@ def test_the_statisticians_numbers_are_one_click_below():
 
 def test_the_noise_floor_is_drawn_with_the_residual():
     made = make_diagnosis(
-        0, samples=200, environment=make_environment(goodness_of_fit=(make_follows("norm", "µT"),), process_noise=())
+        0,
+        samples=200,
+        environment=make_environment(goodness_of_fit=(make_goodness_of_fit("norm", "µT"),), process_noise=()),
     )
     page = diagnosis_report(made)
     assert "Dotted: the sensor's noise floor." in text_of(page)
@@ -305,7 +308,7 @@ def test_the_noise_floor_is_drawn_with_the_residual():
     assert page.count("stroke-dasharray") == without.count("stroke-dasharray") + 2
 
 
-def test_nats_are_explained_once_before_they_are_used():
+def test_nats_are_explained_once_before_their_first_use():
     text = "Log-likelihood gains are in nats"
     for made in (make_diagnosis(3, samples=100, channels=2), disturbed()):
         page = diagnosis_report(made)
@@ -317,9 +320,9 @@ def test_nats_are_explained_once_before_they_are_used():
 def test_names_in_the_environment_are_escaped():
     bad = "<b>x</b> & $a$"
     noise = dataclasses.replace(PROCESS_NOISE, place=bad, unit=bad)
-    forcing = dataclasses.replace(make_forcing(50, noise), sentences=(bad,))
+    forcing = dataclasses.replace(make_disturbance(50, noise), sentences=(bad,))
     hostile = make_environment(
-        goodness_of_fit=(make_follows(bad, bad),),
+        goodness_of_fit=(make_goodness_of_fit(bad, bad),),
         process_noise=(noise,),
         input_hold={bad: "linear"},
         disturbance=(forcing,),
@@ -328,12 +331,12 @@ def test_names_in_the_environment_are_escaped():
     for verdict in ("unfit", "unexplained"):
         page = diagnosis_report(make_diagnosis(0, samples=100, verdict=verdict, environment=hostile))
         assert "<b>" not in page
-        parsed(page)
+        parse_page(page)
 
 
-def test_a_lost_fit_is_not_called_adequate():
+def test_a_poor_fit_with_verdict_adequate_is_reported_as_a_poor_fit():
     lost = make_diagnosis(
-        0, samples=50, environment=make_environment(goodness_of_fit=LOST, process_noise=(), disturbance=())
+        0, samples=50, environment=make_environment(goodness_of_fit=POOR_FITS, process_noise=(), disturbance=())
     )
     assert top.tone(lost) == "open"
-    assert top.headline(lost) == "The simulation does not fit the recording."
+    assert "does not fit the recording" in top.headline(lost)

@@ -1,4 +1,4 @@
-"""No two statements of a report exclude each other; which ones do is the table in ``exclusive``."""
+"""Reports contain no contradictory statements; ``exclusive`` lists the contradictory pairs and rules."""
 
 import dataclasses
 import functools
@@ -23,16 +23,16 @@ from mkc_torch.diagnosis.result import Alternative, Diagnosis, DivergedBlock, Ef
 from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.recording import demonstration
 from mkc_torch.simulation import Magnetometer
-from tests.diagnosis.factory import PROCESS_NOISE, make_diagnosis, make_follows
-from tests.diagnosis.swing import Pendulum, UpsideDown, swung
+from tests.diagnosis.factory import PROCESS_NOISE, make_diagnosis, make_goodness_of_fit
+from tests.diagnosis.swing import Pendulum, UpsideDown, pendulum_recording
 from tests.report.exclusive import PAIRS, Pair, _in_text, contradictions, page_rows, terminal_rows
 
 END = 3.98  # s, of the factory's 200 samples
 LEVEL = 0.05
-LEFT = (DivergedBlock(3, before=True, after=False),)
+DIVERGED = (DivergedBlock(3, before=True, after=False),)
 
 sizes = st.sampled_from((1e-3, 0.3, 0.57, 0.9996, 1.0, 1.004, 1.04, 1.3))
-"""Residual after over before."""
+"""Ratios of the residual after to the residual before."""
 
 
 @st.composite
@@ -45,7 +45,7 @@ def held_outs(draw, unit="rad"):
         outputs["rate"] = ResidualSizes(2.0 * before, 2.0 * draw(sizes) * before, "rad/s")
     return HeldOut(
         gain, (gain - low, gain + high), before, ratio * before, unit,
-        outputs if draw(st.booleans()) else {}, draw(st.sampled_from(((), LEFT))), 25, decides=draw(st.booleans()),
+        outputs if draw(st.booleans()) else {}, draw(st.sampled_from(((), DIVERGED))), 25, decides=draw(st.booleans()),
     )  # fmt: skip
 
 
@@ -99,7 +99,11 @@ def diagnoses(draw):
     noise = 0.005 * draw(st.floats(0.9, 1.2) if white and not process_noise else st.floats(1.0, 20.0))
     lost = draw(st.booleans()) and draw(st.booleans())
     source = draw(st.sampled_from(("samples", "declared")))
-    fit = make_follows(residual=0.36, explained=0.12) if lost else make_follows(residual=noise, floor_source=source)
+    fit = (
+        make_goodness_of_fit(residual=0.36, explained=0.12)
+        if lost
+        else make_goodness_of_fit(residual=noise, floor_source=source)
+    )
     known = FitAssessment((fit,), (), SimpleNamespace(selected=SimpleNamespace(disturbances=process_noise)), lost=lost)
     if lost:
         found = []
@@ -137,30 +141,30 @@ def test_no_page_of_any_diagnosis_contradicts_itself(case):
     assert contradictions(case.diagnosis) == []
 
 
-REAL = {
-    "nothing hidden": lambda: diagnose(Pendulum(), swung("none", N=300)[0], surrogates=39),
-    "drag hidden": lambda: diagnose(Pendulum(), swung("none", N=300, drag=0.3)[0], surrogates=39),
-    "slow process noise": lambda: diagnose(Pendulum(), swung("slow", N=300)[0], surrogates=39),
-    "gravity of the wrong sign": lambda: diagnose(UpsideDown(), swung("none", N=300)[0], surrogates=39),
+RECORDINGS = {
+    "nothing hidden": lambda: diagnose(Pendulum(), pendulum_recording("none", N=300)[0], surrogates=39),
+    "drag hidden": lambda: diagnose(Pendulum(), pendulum_recording("none", N=300, drag=0.3)[0], surrogates=39),
+    "slow process noise": lambda: diagnose(Pendulum(), pendulum_recording("slow", N=300)[0], surrogates=39),
+    "gravity of the wrong sign": lambda: diagnose(UpsideDown(), pendulum_recording("none", N=300)[0], surrogates=39),
     "loudspeaker": lambda: diagnose(Magnetometer(), demonstration.simulated_recording()[0], surrogates=39),
 }
 
 
 @functools.cache
-def real(name):
-    return REAL[name]()
+def diagnosis_of(name):
+    return RECORDINGS[name]()
 
 
 @pytest.mark.e2e
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if "wrong sign" in name else name for name in REAL]
+    "name", [pytest.param(name, marks=pytest.mark.slow) if "wrong sign" in name else name for name in RECORDINGS]
 )
 def test_no_report_of_a_recording_contradicts_itself(name):
-    assert contradictions(real(name)) == []
+    assert contradictions(diagnosis_of(name)) == []
 
 
 @pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: f"{pair.first[:30]}, {pair.second[:30]}")
-def test_a_pair_excludes_something_and_allows_either_alone(pair):
+def test_patterns_of_a_pair_compile_and_do_not_match_empty_text(pair):
     assert re.compile(pair.first).pattern
     assert not re.search(pair.first, "")
     assert not re.search(pair.second, "")
@@ -175,7 +179,9 @@ CORRUPTED = {
     "a claim above the level": {"p_value": 0.3},
     "a claim whose size is 0": {"parameters": (EffectParameter("size", 0.1, 0.4, "µT"),)},
     "an interval that ends before": {"intervals": ((2.0, 1.0),)},
-    "left out, and no form": {"shape": ShapeCheck(40.0, 0.002, make_diagnosis(1, samples=20).findings[0].curve)},
+    "left out, and of another shape": {
+        "shape": ShapeCheck(40.0, 0.002, make_diagnosis(1, samples=20).findings[0].curve)
+    },
     "to be corrected and not to be": {
         "advice": (
             "The model found here corrects for linear_drag: confirm it on a second recording.",
@@ -187,7 +193,7 @@ CORRUPTED = {
 
 
 @pytest.mark.parametrize("name", CORRUPTED)
-def test_a_report_that_contradicts_itself_is_caught(name):
+def test_contradictions_of_a_corrupted_diagnosis_are_detected(name):
     made = make_diagnosis(1, samples=200)
     (finding,) = made.findings
     held = finding.held_out
@@ -216,7 +222,7 @@ def test_a_report_that_contradicts_itself_is_caught(name):
         "The simulation does not fit the recording. The simulation can be used",
     ],
 )
-def test_each_kind_of_pair_is_found_in_a_text(row):
+def test_contradictory_texts_in_a_row_are_detected(row):
     assert list(_in_text([row], make_diagnosis(1, samples=20)))
 
 
@@ -228,7 +234,7 @@ def test_texts_on_different_findings_are_not_compared():
     assert list(_in_text([*rows, "surely better on held-out blocks"], make_diagnosis(2, samples=20)))
 
 
-def test_a_page_and_a_terminal_are_read_row_by_row():
+def test_page_and_terminal_are_split_into_rows():
     page = "<style>p{}</style><h1>One</h1><table><tr><th>where</th><td>from<br>1&nbsp;s</td></tr></table><p>two</p>"
     assert page_rows(page) == ["One", "where from 1 s", "two"]
     rows = terminal_rows(make_diagnosis(1, samples=20))

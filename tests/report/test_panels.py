@@ -38,10 +38,10 @@ def diagnosis():
 
 
 def measured(page, folder, *, width, dark=False):
-    """Whether panels are stacked and inside the page, and the colours of page, picture and text."""
+    """Return the layout of the panels, and the colours of page, picture and text, in a browser."""
     (folder / "page.html").write_text(page, encoding="utf-8")
     (folder / "frame.html").write_text(MEASURE.format(width=width), encoding="utf-8")
-    result = phone.dumped(folder, *(("--blink-settings=preferredColorScheme=0",) if dark else ()))
+    result = phone.dump_frame(folder, *(("--blink-settings=preferredColorScheme=0",) if dark else ()))
     found = re.search(r"found \| (.+?) \| end", result.stdout)
     assert found, result.stderr[-1000:]
     return found[1].split(" | ")
@@ -67,13 +67,13 @@ def test_texts_of_pictures_follow_the_theme_of_the_page(diagnosis, tmp_path):
     assert min(map(int, re.findall(r"\d+", dark[1]))) > 200
 
 
-def test_no_colour_of_a_picture_is_one_of_a_light_page_alone(diagnosis):
+def test_colours_of_pictures_are_variables_of_the_theme(diagnosis):
     drawn = "".join(re.findall(r"<svg.*?</svg>", diagnosis_report(diagnosis), re.DOTALL))
     assert "var(--ink, #222222)" in drawn
     assert re.findall(r": #(?:222222|9a4300|ffffff|0072b2|d55e00)\b", drawn) == []
 
 
-def test_no_text_of_a_diagnosis_is_cut_at_the_edge_of_its_panel(diagnosis, monkeypatch):
+def test_texts_of_a_diagnosis_are_inside_their_panels(diagnosis, monkeypatch):
     figures = []
     monkeypatch.setattr(panels, "svg", lambda figure, *_: figures.append(figure) or "")
     monkeypatch.setattr("mkc_torch.report.diagnosis.page.shared", lambda works: [work() for work in works])
@@ -91,12 +91,12 @@ def test_no_text_of_a_diagnosis_is_cut_at_the_edge_of_its_panel(diagnosis, monke
 
 
 def test_the_table_of_candidates_has_the_order_of_the_matrix(diagnosis):
-    """Both have the order of the search, which is that of the penalised gain."""
+    """Both are in the order of the search, by penalised gain."""
     reversed_ = diagnosis.candidates[::-1]
     assert [bar.candidate for bar in bars(reversed_)] == list(reversed_[:12])
 
 
-def test_channels_of_several_units_have_each_their_own(diagnosis):
+def test_channels_of_several_units_have_separate_axes_with_their_units(diagnosis):
     traces = dataclasses.replace(diagnosis.traces, channels=("angle", "turn_x"), unit="")
     made = dataclasses.replace(diagnosis, traces=traces)
     drawn = re.findall(r"<svg.*?</svg>", diagnosis_report(made), re.DOTALL)
@@ -106,7 +106,7 @@ def test_channels_of_several_units_have_each_their_own(diagnosis):
     pyplot.close("all")
 
 
-def test_a_state_without_a_unit_has_that_of_the_output_with_its_name(diagnosis):
+def test_a_state_without_a_unit_has_the_unit_of_the_output_of_its_name(diagnosis):
     edges = tuple(torch.linspace(-1.0, 1.0, 5, dtype=torch.float64) for _ in range(2))
     nats = 400.0 * torch.arange(-3.0, 13.0, dtype=torch.float64).reshape(4, 4)
     found = StateMap(("angle", "rate"), ("", "rad/s"), edges, nats)

@@ -18,8 +18,14 @@ from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.report import Comparison, calibration_report, refusal_report
 from mkc_torch.report.diagnosis.page import diagnosis_report
 from tests.blind_proof import test_scenarios_score as scenario_score
-from tests.blind_proof.test_score import NOTHING, answer, finding, key, score
-from tests.diagnosis.factory import make_diagnosis, make_environment, make_follows, make_unfit, nearest
+from tests.blind_proof.test_score import ADEQUATE, answer, finding, key, score
+from tests.diagnosis.factory import (
+    make_diagnosis,
+    make_environment,
+    make_goodness_of_fit,
+    make_unfit,
+    with_another_shape,
+)
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = (
@@ -42,8 +48,8 @@ document.getElementById("phone").onload = (event) => {{
 }};</script>"""
 
 
-def dumped(folder, *flags):
-    """The frame of a folder as the browser dumps it after its scripts have run."""
+def dump_frame(folder, *flags):
+    """Run the browser on the frame of a folder; its output is the document after all scripts."""
     command = [
         CHROMIUM, *FLAGS, *flags, f"--user-data-dir={folder / 'profile'}", "--allow-file-access-from-files",
         "--virtual-time-budget=5000", "--dump-dom", (folder / "frame.html").as_uri(),
@@ -52,16 +58,16 @@ def dumped(folder, *flags):
 
 
 def width_of(page, folder, *, opened):
-    """The width in pixels that a page needs on a telephone, with its details open or closed."""
+    """Return the width in pixels that a page needs on a telephone, with its details open or closed."""
     (folder / "page.html").write_text(page, encoding="utf-8")
     (folder / "frame.html").write_text(FRAME.format(width=WIDTH, open=str(opened).lower()), encoding="utf-8")
-    result = dumped(folder)
+    result = dump_frame(folder)
     found = re.search(r"width (\d+) end", result.stdout)
     assert found, f"{CHROMIUM} measured nothing: {result.stderr[-1000:]}"
     return int(found[1])
 
 
-MANY = """<!doctype html><body style="margin:0">{frames}<p id="result"></p><script>
+MANY_FRAMES = """<!doctype html><body style="margin:0">{frames}<p id="result"></p><script>
 window.onload = () => {{
   const widths = [...document.querySelectorAll("iframe")].map((frame) =>
     frame.id + " " + frame.contentDocument.documentElement.scrollWidth);
@@ -70,24 +76,24 @@ window.onload = () => {{
 
 
 def widths_of(places, folder):
-    """The widths in pixels that several pages need, measured by one browser."""
+    """Return the widths in pixels that several pages need, measured in a single browser."""
     frames = "".join(
         f'<iframe id="{name}" src="{place}" style="width:{WIDTH}px;height:900px;border:0"></iframe>'
         for name, place in places.items()
     )
-    (folder / "frame.html").write_text(MANY.format(frames=frames), encoding="utf-8")
-    result = dumped(folder)
+    (folder / "frame.html").write_text(MANY_FRAMES.format(frames=frames), encoding="utf-8")
+    result = dump_frame(folder)
     found = re.search(r"widths (.+?) end", result.stdout)
     assert found, f"{CHROMIUM} measured nothing: {result.stderr[-1000:]}"
     return {name: int(width) for name, width in (item.rsplit(" ", 1) for item in found[1].split(", "))}
 
 
 def long_names():
-    """A diagnosis in which every text from a file is too long."""
+    """Return a diagnosis in which every text from a file is too long."""
     made = make_diagnosis(3, samples=200, channels=4, recording=LONG, simulation=LONG, warnings=(LONG,))
     findings = tuple(dataclasses.replace(f, drivers=(LONG,), equation=LONG, explanation=LONG) for f in made.findings)
     environment = make_environment(
-        goodness_of_fit=(make_follows(LONG, LONG),), reasons=(LONG,), input_hold={LONG: "held"}
+        goodness_of_fit=(make_goodness_of_fit(LONG, LONG),), reasons=(LONG,), input_hold={LONG: "held"}
     )
     return dataclasses.replace(made, findings=findings, advice=(LONG,), environment=environment)
 
@@ -95,7 +101,7 @@ def long_names():
 def first_nearest():
     made = make_diagnosis(2, samples=200, channels=4, verdict="unexplained")
     first, *rest = made.findings
-    return dataclasses.replace(made, findings=(nearest(first), *rest))
+    return dataclasses.replace(made, findings=(with_another_shape(first), *rest))
 
 
 PAGES = {
@@ -107,8 +113,8 @@ PAGES = {
 }
 
 
-def others():
-    """Pages of a calibration, a refusal and the blind proofs, with names that are too long."""
+def other_pages():
+    """Yield pages of a calibration, a refusal and the blind proofs, with names that are too long."""
     recording, _ = simulated_recording()
     named = type(recording)(recording.columns, name=LONG, warnings=(LONG,))
     row = Comparison(LONG, (12.0, -7.5, 21.0), (45.0, 48.5, 51.5))
@@ -120,14 +126,14 @@ def others():
     yield "refusal", refusal_report(flat, refused.value)
     keys = [key(name, kind) for name, kind in (("a", "single"), ("b", "empty"), ("c", "single"), (LONG, "single"))]
     settings = scenario_score.SETTINGS | {"hidden": 3, LONG: LONG}
-    result = score(keys, {"a": answer(finding("hard_iron_step")), "b": NOTHING, "c": answer(finding("offset_drift"))})
+    result = score(keys, {"a": answer(finding("hard_iron_step")), "b": ADEQUATE, "c": answer(finding("offset_drift"))})
     yield "proof", proof_page(ProofScore((), result, tuple(result.cases)), {LONG: result}, settings)
     yield "scenarios", proof_page(scenario_score.all_kinds(), {}, settings)
 
 
-def test_no_other_page_is_wider_than_a_telephone(tmp_path):
+def test_calibration_refusal_and_proof_pages_fit_a_telephone(tmp_path):
     places = {}
-    for name, page in others():
+    for name, page in other_pages():
         places[name] = f"{name}.html"
         (tmp_path / places[name]).write_text(page, encoding="utf-8")
     assert widths_of(places, tmp_path) == dict.fromkeys(places, WIDTH)
@@ -135,7 +141,7 @@ def test_no_other_page_is_wider_than_a_telephone(tmp_path):
 
 @pytest.mark.parametrize("opened", [False, True])
 @pytest.mark.parametrize("kind", PAGES)
-def test_a_diagnosis_page_is_no_wider_than_a_telephone(kind, opened, tmp_path):
+def test_diagnosis_pages_fit_a_telephone(kind, opened, tmp_path):
     assert width_of(diagnosis_report(PAGES[kind]()), tmp_path, opened=opened) == WIDTH
 
 

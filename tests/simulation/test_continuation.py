@@ -68,19 +68,19 @@ class RecordedStarts:
 
     def answer(self, theta, changes, near=None):
         self.starts.append(near)
-        return Answer(theta.unsqueeze(-1), Found(float(theta)))
+        return Answer(theta.unsqueeze(-1), SolutionStub(float(theta)))
 
     def compiled(self, meaning, size):
         return None
 
 
-class Found:
+class SolutionStub:
     def __init__(self, value, whole=True):
         self.value, self.whole = value, whole
 
     @property
     def bare(self):
-        return Found(self.value, whole=False)
+        return SolutionStub(self.value, whole=False)
 
     def __eq__(self, other):
         return (self.value, self.whole) == (other.value, other.whole)
@@ -90,19 +90,24 @@ class Found:
 
 def test_each_evaluation_starts_from_the_previous_and_a_repeated_evaluation_from_itself():
     simulation = RecordedStarts()
-    continuation = Continuation(simulation, lambda p: (p, {}), Found(0.0))
+    continuation = Continuation(simulation, lambda p: (p, {}), SolutionStub(0.0))
     for value in (1.0, 2.0, 2.0, 1.0):
         continuation(torch.tensor([value]))
-    assert simulation.starts == [Found(0.0), Found(1.0), Found(2.0), Found(1.0, whole=False)]
-    assert continuation.near(torch.tensor([2.0])) == Found(2.0, whole=False)
-    assert continuation.near(torch.tensor([3.0])) == Found(1.0, whole=False)
+    assert simulation.starts == [
+        SolutionStub(0.0),
+        SolutionStub(1.0),
+        SolutionStub(2.0),
+        SolutionStub(1.0, whole=False),
+    ]
+    assert continuation.near(torch.tensor([2.0])) == SolutionStub(2.0, whole=False)
+    assert continuation.near(torch.tensor([3.0])) == SolutionStub(1.0, whole=False)
 
 
 def test_evaluations_inside_of_a_transform_are_not_kept():
     simulation = RecordedStarts()
-    continuation = Continuation(simulation, lambda p: (p, {}), Found(0.0))
+    continuation = Continuation(simulation, lambda p: (p, {}), SolutionStub(0.0))
     assert prepared().answer(theta(4.0), {}).nearby is not None
     seen = []
     torch.func.jvp(lambda p: seen.append(prepared().answer(p, {})) or seen[0].residual, (theta(4.0),), (theta(1.0),))
     assert seen[0].nearby is None
-    assert continuation.near(torch.tensor([1.0])) == Found(0.0, whole=False)
+    assert continuation.near(torch.tensor([1.0])) == SolutionStub(0.0, whole=False)

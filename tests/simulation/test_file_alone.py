@@ -1,4 +1,4 @@
-"""``--simulation FILE.py`` without a class, and functions that tensors do not take."""
+"""``--simulation FILE.py`` without a class, and functions that do not accept tensors."""
 
 import pytest
 import torch
@@ -6,7 +6,7 @@ import torch
 from mkc_torch import Recording, diagnose
 from mkc_torch.simulation.load import SimulationFileError, load_simulation, raised_in
 
-KIND = """
+SOURCE = """
 import math
 import numpy
 import torch
@@ -25,11 +25,11 @@ class {name}(Dynamics):
 
 def write(tmp_path, *names, function="torch.sin"):
     path = tmp_path / "motor.py"
-    path.write_text("".join(KIND.format(name=name, function=function) for name in names))
+    path.write_text("".join(SOURCE.format(name=name, function=function) for name in names))
     return str(path)
 
 
-def test_the_only_class_of_a_file_is_taken(tmp_path):
+def test_the_single_class_of_a_file_is_loaded(tmp_path):
     assert type(load_simulation(write(tmp_path, "Motor"))).__name__ == "Motor"
 
 
@@ -50,7 +50,7 @@ def test_a_file_without_a_simulation_and_a_missing_file_are_refused(tmp_path):
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("function", ["math.sin", "numpy.sin", "float"])
-def test_functions_of_math_and_numpy_are_answered_with_those_of_torch(tmp_path, function):
+def test_errors_of_math_and_numpy_functions_name_those_of_torch(tmp_path, function):
     path = write(tmp_path, "Motor", function=function)
     time = torch.arange(60) / 20.0
     recording = Recording({"time": time, "speed": torch.exp(-time)})

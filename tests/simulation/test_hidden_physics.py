@@ -15,7 +15,7 @@ from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics
 from tests.simulation.dynamics.runge_kutta import runge_kutta
 
-OF = {effect.id: effect for effect in DYNAMICS}
+EFFECTS = {effect.id: effect for effect in DYNAMICS}
 TIME = np.arange(150) * 0.04
 
 
@@ -45,16 +45,16 @@ class Ball(Dynamics):
 
 
 def drive(t):
-    """A force that is linear between the samples, as in the simulation."""
+    """Return a force that is linear between the samples, as in the simulation."""
     return np.interp(t, TIME, np.sin(2.3 * TIME) + np.sin(0.9 * TIME))
 
 
-def spun(t):
+def spin(t):
     return np.interp(t, TIME, 30.0 + 10.0 * np.cos(3.0 * TIME))
 
 
-def played_back(gap):
-    """The drive behind play, by its definition."""
+def drive_behind_play(gap):
+    """Return the drive behind play, by its definition."""
     u = drive(TIME)
     y = u.copy()
     for k in range(1, len(u)):
@@ -69,7 +69,7 @@ def mass(force=lambda *_: 0.0, inertia=1.0):
     return rate
 
 
-def hysteretic(gamma, yields):
+def hysteretic_mass(gamma, yields):
     def rate(t, y):
         x, v, z = y
         plain = drive(t) - 4.0 * x - 0.3 * v
@@ -78,8 +78,8 @@ def hysteretic(gamma, yields):
     return rate
 
 
-def dragged(gamma, lag):
-    """A second mass behind a damper: its speed is the third state."""
+def damped_second_mass(gamma, lag):
+    """Return the rate of a mass with a second mass behind a damper, whose speed is the third state."""
 
     def rate(t, y):
         x, v, w = y
@@ -88,8 +88,8 @@ def dragged(gamma, lag):
     return rate
 
 
-def sprung(share, period, damping):
-    """A second mass on a spring: its position and its speed are the third and fourth state."""
+def sprung_second_mass(share, period, damping):
+    """Return the rate of a mass with a second mass on a spring, whose position and speed are the last two states."""
     omega = 2.0 * math.pi / period
 
     def rate(t, y):
@@ -100,7 +100,7 @@ def sprung(share, period, damping):
     return rate
 
 
-def turned(coefficient):
+def lifted_ball(coefficient):
     def rate(t, y):
         _, _, vx, vy = y
         w = coefficient(t)
@@ -109,12 +109,12 @@ def turned(coefficient):
     return rate
 
 
-def dipped(x, _):
+def buoyant_rate(x, _):
     return 6.0 * min(max((0.3 - x) / 0.5, 0.0), 1.0)
 
 
-def with_play():
-    behind = played_back(0.4)
+def mass_with_play():
+    behind = drive_behind_play(0.4)
     # between the samples the load is not linear where the gap starts and ends
     fine = np.linspace(0.0, TIME[-1], 40 * (len(TIME) - 1) + 1)
     side = drive(fine)
@@ -130,27 +130,27 @@ def with_play():
 
 # effect: port, shape, γ, the equations with the effect, their initial states, tolerance
 CASES = {
-    "backlash": ("input drive", {"half_gap": 0.4}, [1.0], with_play(), [0.5, 0.0], 2e-3),
+    "backlash": ("input drive", {"half_gap": 0.4}, [1.0], mass_with_play(), [0.5, 0.0], 2e-3),
     "bouc_wen_hysteresis": (
-        "hysteretic rate of speed", {"yield_deflection": 0.2}, [3.0], hysteretic(3.0, 0.2), [0.5, 0.0, 0.0], 2e-4,
+        "hysteretic rate of speed", {"yield_deflection": 0.2}, [3.0], hysteretic_mass(3.0, 0.2), [0.5, 0.0, 0.0], 2e-4,
     ),
     "hidden_lag": (
-        "lagged rate of speed", {"time_constant": 0.4}, [0.6], dragged(1.5, 0.4), [0.5, 0.7, 0.7], 1e-4,
+        "lagged rate of speed", {"time_constant": 0.4}, [0.6], damped_second_mass(1.5, 0.4), [0.5, 0.7, 0.7], 1e-4,
     ),
     "hidden_mode": (
-        "resonant rate of speed", {"period": 0.9, "damping": 0.1}, [0.3], sprung(0.3, 0.9, 0.1),
+        "resonant rate of speed", {"period": 0.9, "damping": 0.1}, [0.3], sprung_second_mass(0.3, 0.9, 0.1),
         [0.5, 0.7, 0.5, 0.7], 2e-4,
     ),
     "added_mass": ("rate of speed", {}, [0.2], mass(inertia=1.25), [0.5, 0.0], 1e-4),
-    "buoyancy": ("rate of speed", {"surface": 0.3, "draught": 0.5}, [6.0], mass(dipped), [0.5, 0.0], 2e-4),
+    "buoyancy": ("rate of speed", {"surface": 0.3, "draught": 0.5}, [6.0], mass(buoyant_rate), [0.5, 0.0], 2e-4),
     "magnus_lift": (
-        "exchange of vx and vy", {}, [0.4], turned(lambda _: 0.4), [0.0, 1.0, 20.0, 5.0], 1e-4,
+        "exchange of vx and vy", {}, [0.4], lifted_ball(lambda _: 0.4), [0.0, 1.0, 20.0, 5.0], 1e-4,
     ),
 }  # fmt: skip
 
 
 def prepared(name, rate, first, **attributes):
-    """The simulation of a recording with the effect, the true states, and the true parameters."""
+    """Return the simulation of a recording with the effect, the true states, and the true parameters."""
     system = Ball if name == "magnus_lift" else Mass
     known = list(system.states[:2])
     truth = runge_kutta(rate, first, TIME)
@@ -162,8 +162,8 @@ def prepared(name, rate, first, **attributes):
     return simulation.prepare(recording), torch.from_numpy(truth[:, :2]), theta
 
 
-def joint(name, simulation, shape, gamma, theta):
-    term = Term(OF[name], None, shape, CASES[name][0])
+def joint_model(name, simulation, shape, gamma, theta):
+    term = Term(EFFECTS[name], None, shape, CASES[name][0])
     model = JointModel(simulation, (term,))
     return model, torch.cat([theta, torch.tensor(gamma, dtype=torch.float64)])
 
@@ -175,7 +175,7 @@ class TestAgainstSteps:
     def test_residual_is_zero_at_the_truth(self, name):
         _, shape, gamma, rate, first, tolerance = CASES[name]
         simulation, truth, theta = prepared(name, rate, first)
-        model, parameters = joint(name, simulation, shape, gamma, theta)
+        model, parameters = joint_model(name, simulation, shape, gamma, theta)
         assert float(model.residual(parameters).abs().max()) < tolerance * float(truth.abs().max())
         without = simulation.residual(theta, {})
         assert float(without.abs().max()) > 30.0 * tolerance * float(truth.abs().max())
@@ -184,7 +184,7 @@ class TestAgainstSteps:
         """In forward mode, in reverse mode and under vmap, by all parameters."""
         _, shape, gamma, rate, first, _ = CASES[name]
         simulation, _, theta = prepared(name, rate, first, step=0.04)
-        model, parameters = joint(name, simulation, shape, gamma, theta)
+        model, parameters = joint_model(name, simulation, shape, gamma, theta)
         slope = torch.func.jacfwd(model.residual)(parameters)  # vmap over jvp
         step = 1e-5 * torch.eye(len(parameters), dtype=torch.float64)
         near = [(model.residual(parameters + h) - model.residual(parameters - h)) / 2e-5 for h in step]
@@ -198,7 +198,7 @@ class TestAgainstSteps:
         """The tangent of a candidate is the derivative of the joint model at amplitude 0."""
         _, shape, gamma, rate, first, _ = CASES[name]
         simulation, _, theta = prepared(name, rate, first, step=0.02)
-        model, parameters = joint(name, simulation, shape, [0.0] * len(gamma), theta)
+        model, parameters = joint_model(name, simulation, shape, [0.0] * len(gamma), theta)
         found = tangents_of(JointModel(simulation), theta, NoiseSettings(), model.terms).candidates[0]
         exact = torch.func.jacfwd(model.residual)(parameters)[..., -1:]
         torch.testing.assert_close(found, exact, rtol=0.0, atol=0.01 * float(exact.abs().max()))
@@ -210,7 +210,7 @@ class TestMemory:
     def model(self, **attributes):
         _, shape, gamma, rate, first, _ = CASES["bouc_wen_hysteresis"]
         simulation, _, theta = prepared("bouc_wen_hysteresis", rate, first, **attributes)
-        return joint("bouc_wen_hysteresis", simulation, shape, gamma, theta)
+        return joint_model("bouc_wen_hysteresis", simulation, shape, gamma, theta)
 
     def test_a_constant_force_does_not_act_on_the_internal_state(self):
         model, parameters = self.model()
@@ -235,7 +235,7 @@ class TestMemory:
         for name, like in (("hidden_lag", ("speed",)), ("hidden_mode", ("", "speed"))):
             _, shape, gamma, rate, first, _ = CASES[name]
             simulation, _, theta = prepared(name, rate, first)
-            model, parameters = joint(name, simulation, shape, gamma, theta)
+            model, parameters = joint_model(name, simulation, shape, gamma, theta)
             begin = simulation.trajectory(theta, model.changes(parameters)).states[0]
             assert tuple(simulation.ports[CASES[name][0]].memory.values()) == like
             assert begin[2:].tolist() == [float(first[1]) if name else 0.0 for name in like]
@@ -247,28 +247,28 @@ class TestMemory:
         left = []
         for lag in (1e-2, 1e-3, 1e-4):
             exchange = 1.5  # with a vanishing store
-            model, parameters = joint("hidden_lag", simulation, {"time_constant": lag}, [exchange * lag], theta)
+            model, parameters = joint_model("hidden_lag", simulation, {"time_constant": lag}, [exchange * lag], theta)
             left.append(float((model.residual(parameters) - plain).abs().max()))
         assert left[0] > 9.0 * left[1] > 81.0 * left[2]
         assert left[2] < 1e-3
 
     def test_a_store_with_a_short_lag_adds_its_capacity(self):
         simulation, _, theta = prepared("hidden_lag", *CASES["hidden_lag"][3:5])
-        larger = JointModel(simulation, (Term(OF["added_mass"], None, {}, "rate of speed"),))
+        larger = JointModel(simulation, (Term(EFFECTS["added_mass"], None, {}, "rate of speed"),))
         whole = larger.residual(torch.cat([theta, theta.new_tensor([0.6 / 1.6])]))
-        model, parameters = joint("hidden_lag", simulation, {"time_constant": 1e-3}, [0.6], theta)
+        model, parameters = joint_model("hidden_lag", simulation, {"time_constant": 1e-3}, [0.6], theta)
         away = (whole - simulation.residual(theta, {})).abs().max()
         assert float((model.residual(parameters) - whole).abs().max()) < 0.02 * float(away)
 
     def test_a_stiff_spring_adds_its_mass(self):
         _, _, _, rate, first, _ = CASES["hidden_mode"]
         simulation, _, theta = prepared("hidden_mode", rate, first)
-        heavier = JointModel(simulation, (Term(OF["added_mass"], None, {}, "rate of speed"),))
+        heavier = JointModel(simulation, (Term(EFFECTS["added_mass"], None, {}, "rate of speed"),))
         rigid = heavier.residual(torch.cat([theta, theta.new_tensor([0.3 / 1.3])]))
         left = []
         for period in (0.4, 0.1):
             shape = {"period": period, "damping": 0.5}
-            model, parameters = joint("hidden_mode", simulation, shape, [0.3], theta)
+            model, parameters = joint_model("hidden_mode", simulation, shape, [0.3], theta)
             left.append(float((model.residual(parameters) - rigid).abs().max()))
         assert left[1] < 0.25 * left[0]
         assert left[1] < 0.05 * float((rigid - simulation.residual(theta, {})).abs().max())
@@ -277,13 +277,13 @@ class TestMemory:
         """Each effect has its own internal states, with any other effects at the rate."""
         names = ("bouc_wen_hysteresis", "hidden_lag", "hidden_mode")
         simulation, _, theta = prepared("hidden_lag", *CASES["hidden_lag"][3:5])
-        terms = [Term(OF[name], None, CASES[name][1], CASES[name][0]) for name in names]
+        terms = [Term(EFFECTS[name], None, CASES[name][1], CASES[name][0]) for name in names]
         model = JointModel(simulation, terms)
         gammas = [theta.new_tensor(CASES[name][2]) for name in names]
         assert simulation.trajectory(theta, model.changes(torch.cat([theta, *gammas]))).states.shape[1] == 6
         for k, name in enumerate(names):
             only = [gamma if i == k else 0.0 * gamma for i, gamma in enumerate(gammas)]
-            alone, parameters = joint(name, simulation, CASES[name][1], CASES[name][2], theta)
+            alone, parameters = joint_model(name, simulation, CASES[name][1], CASES[name][2], theta)
             jointly = model.residual(torch.cat([theta, *only]))
             torch.testing.assert_close(jointly, alone.residual(parameters), rtol=0.0, atol=1e-9)
 
@@ -300,21 +300,21 @@ class TestMemory:
         )
         simulation = type("Mass", (Mass,), {"step": 0.01})().prepare(both)
         theta = torch.tensor([0.3, *first[:2], -0.2, 1.0], dtype=torch.float64)
-        model, parameters = joint("bouc_wen_hysteresis", simulation, shape, gamma, theta)
+        model, parameters = joint_model("bouc_wen_hysteresis", simulation, shape, gamma, theta)
         assert float(model.residual(parameters).abs().max()) < 2e-4
 
 
 def test_a_recorded_spin_drives_the_lift():
     """γ₁ at the mean spin, and γ₂ per unit of deviation."""
-    truth = runge_kutta(turned(lambda t: 0.01 * spun(t)), [0.0, 1.0, 20.0, 5.0], TIME)
-    recording = table(time=TIME, x=truth[:, 0], y=truth[:, 1], spin=spun(TIME))
+    truth = runge_kutta(lifted_ball(lambda t: 0.01 * spin(t)), [0.0, 1.0, 20.0, 5.0], TIME)
+    recording = table(time=TIME, x=truth[:, 0], y=truth[:, 1], spin=spin(TIME))
     simulation = type("Ball", (Ball,), {"step": 0.01})().prepare(recording)
     from mkc_torch.diagnosis.model.term import find_drivers
 
     (driver,) = find_drivers(
         simulation.recording, simulation.system.columns, DriverSettings(), frozenset({"spin"})
     ).drivers
-    model = JointModel(simulation, (Term(OF["magnus_lift"], driver, {}, "exchange of vx and vy"),))
+    model = JointModel(simulation, (Term(EFFECTS["magnus_lift"], driver, {}, "exchange of vx and vy"),))
     mean = 0.01 * float(driver.reference)
     parameters = torch.tensor([0.05, 0.0, 1.0, 20.0, 5.0, mean, 0.01], dtype=torch.float64)
     assert float(model.residual(parameters).abs().max()) < 1e-3
@@ -335,7 +335,7 @@ def test_added_mass_is_not_identifiable_next_to_an_inertia():
     simulation = Own().prepare(table(time=TIME, drive=drive(TIME), height=truth[:, 0]))
     theta = torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64)
     found = tangents_of(
-        JointModel(simulation), theta, NoiseSettings(), (Term(OF["added_mass"], None, {}, "rate of speed"),)
+        JointModel(simulation), theta, NoiseSettings(), (Term(EFFECTS["added_mass"], None, {}, "rate of speed"),)
     )
     own, tangent = found.nuisance[:, 0], found.candidates[0][:, 0]
     remainder = tangent - own @ torch.linalg.lstsq(own, tangent).solution
@@ -358,7 +358,7 @@ def test_runs_on_a_common_clock_have_separate_inputs(name):
             experiment=np.repeat([0.0, 1.0], 60),
         )
         simulation = type("Mass", (Mass,), {"step": 0.05})().prepare(recording)
-        model = JointModel(simulation, (Term(OF[name], None, shape, "input drive"),))
+        model = JointModel(simulation, (Term(EFFECTS[name], None, shape, "input drive"),))
         simulated.append(model.residual(torch.cat([theta, theta.new_ones(1)])))
     torch.testing.assert_close(simulated[0], simulated[1], rtol=0.0, atol=1e-9)
     assert math.isfinite(float(simulated[0].abs().max()))
@@ -381,7 +381,7 @@ def test_an_unused_input_has_zero_tangents():
     recording = Recording({"time": time, "torque": torch.sin(time), "angle": torch.cos(3.0 * time)})
     simulation = Idle().prepare(recording)
     terms = [
-        Term(OF[name], None, shape, "input torque")
+        Term(EFFECTS[name], None, shape, "input torque")
         for name, shape in (("input_delay", {"delay": 0.1}), ("dead_zone", {"width": 0.3, "softness": 0.1}))
     ]
     found = tangents_of(JointModel(simulation), simulation.start(), NoiseSettings(), terms).candidates

@@ -7,7 +7,7 @@ from mkc_torch import Recording
 from mkc_torch.simulation import Dynamics, SimulationError, SimulationFileError, load_simulation
 from mkc_torch.simulation.load import raised_in
 
-GOOD = """
+VALID_SOURCE = """
 from mkc_torch.simulation import Dynamics
 from neighbour import RATE
 
@@ -27,18 +27,18 @@ NUMBER = 3
 def file(tmp_path):
     (tmp_path / "neighbour.py").write_text("RATE = 0.5\n")
     path = tmp_path / "my.py"
-    path.write_text(GOOD)
+    path.write_text(VALID_SOURCE)
     yield path
     sys.modules.pop("neighbour", None)
 
 
-def test_a_class_and_an_instance(file):
+def test_a_class_or_an_instance_is_loaded(file):
     for name in ("Decay", "ready"):
         assert load_simulation(f"{file}:{name}").name == "Decay"
     assert str(file.parent) not in sys.path
 
 
-def test_a_relative_path(file, monkeypatch):
+def test_a_relative_path_is_loaded_and_its_errors_show_the_line(file, monkeypatch):
     monkeypatch.chdir(file.parent)
     assert load_simulation("my.py:Decay").name == "Decay"
     file.write_text("1 / 0")
@@ -56,7 +56,7 @@ def test_a_relative_path(file, monkeypatch):
         ("my.py:NUMBER", "`NUMBER` is not a simulation"),
     ],
 )
-def test_what_cannot_be_loaded(file, monkeypatch, source, words):
+def test_invalid_sources_are_refused_with_the_remedy(file, monkeypatch, source, words):
     monkeypatch.chdir(file.parent)
     with pytest.raises(SimulationFileError, match=words):
         load_simulation(source)
@@ -75,7 +75,7 @@ def test_what_cannot_be_loaded(file, monkeypatch, source, words):
         ),
     ],
 )
-def test_a_file_that_raises_shows_its_own_lines(tmp_path, text, words):
+def test_errors_of_a_file_show_the_lines_of_the_user(tmp_path, text, words):
     path = tmp_path / "my.py"
     path.write_text(text)
     with pytest.raises(SimulationFileError) as caught:
@@ -88,10 +88,12 @@ def test_a_file_that_raises_shows_its_own_lines(tmp_path, text, words):
     assert "_simulation_my" not in sys.modules or "Decay()" in message
 
 
-def test_code_that_raises_while_it_simulates(tmp_path):
+def test_errors_during_a_simulation_show_the_lines_of_the_user(tmp_path):
     path = tmp_path / "my.py"
     path.write_text(
-        GOOD.replace("from neighbour import RATE", "RATE = 1.0").replace("p.rate * x.level", "p.speed * x.level")
+        VALID_SOURCE.replace("from neighbour import RATE", "RATE = 1.0").replace(
+            "p.rate * x.level", "p.speed * x.level"
+        )
     )
     simulation = load_simulation(f"{path}:Decay")
     time = torch.arange(0.0, 5.0, 0.1)
@@ -104,7 +106,7 @@ def test_code_that_raises_while_it_simulates(tmp_path):
     assert raised_in(f"{path}:Decay", ValueError("elsewhere")) is None
 
 
-class Wrong(Dynamics):
+class DynamicsReturning(Dynamics):
     states = ("level",)
     parameters = {"rate": 0.5}
 
@@ -125,15 +127,15 @@ class Wrong(Dynamics):
         (lambda x: {"level": (x.level - 10.0).sqrt()}, "is nan at time 0 s with level = 1; parameters rate = 0.5"),
     ],
 )
-def test_a_derivative_that_cannot_be_used(value, words):
+def test_invalid_derivatives_are_refused_with_the_reason(value, words):
     time = torch.arange(0.0, 5.0, 0.1)
     with pytest.raises(SimulationError, match=words):
-        Wrong(value).prepare(Recording({"time": time, "level": torch.exp(-time)}))
+        DynamicsReturning(value).prepare(Recording({"time": time, "level": torch.exp(-time)}))
 
 
 def test_a_file_elsewhere_imports_modules_of_the_current_folder(tmp_path, monkeypatch):
-    """As a corrected.py in a folder of results imports its base class."""
-    (tmp_path / "own_base_of_a_test.py").write_text(TEXT_OF_A_BASE, encoding="utf-8")
+    """For example, a corrected.py in a folder of results imports its base class."""
+    (tmp_path / "own_base_of_a_test.py").write_text(BASE_SOURCE, encoding="utf-8")
     results = tmp_path / "results"
     results.mkdir()
     (results / "corrected.py").write_text(
@@ -149,8 +151,8 @@ def test_a_file_elsewhere_imports_modules_of_the_current_folder(tmp_path, monkey
 
 
 def test_a_file_imports_another_file_of_its_name(tmp_path, monkeypatch):
-    """As a corrected.py of another corrected.py."""
-    (tmp_path / "corrected.py").write_text(TEXT_OF_A_BASE, encoding="utf-8")
+    """For example, a corrected.py of another corrected.py."""
+    (tmp_path / "corrected.py").write_text(BASE_SOURCE, encoding="utf-8")
     results = tmp_path / "results"
     results.mkdir()
     (results / "corrected.py").write_text(
@@ -170,7 +172,7 @@ def test_a_missing_base_is_refused_with_the_remedy(tmp_path):
         load_simulation(f"{tmp_path / 'corrected.py'}:Base")
 
 
-TEXT_OF_A_BASE = """
+BASE_SOURCE = """
 from mkc_torch.simulation import Dynamics
 
 

@@ -79,14 +79,14 @@ def test_clock_offsets_below_a_sample_are_not_findings():
     assert float(found.model.theta[0]) == pytest.approx(0.02, abs=0.006)
 
 
-def late(prepared, effect, port="output y"):
-    """A joint model with a single effect."""
+def with_effect(prepared, effect, port="output y"):
+    """Return a joint model with a single effect."""
     return JointModel(prepared, (Term(effect, None, {}, port),))
 
 
 def test_a_delay_is_complete_and_the_clock_offset_is_held():
     prepared = Paired(simulator()).prepare(recorded(signal(times() - 0.2)))
-    model = late(prepared, Delay())
+    model = with_effect(prepared, Delay())
     start = torch.tensor([-0.06, 0.0, 0.155], dtype=torch.float64)  # a clock with nearly its largest offset
     found = fitted(model, start, graduate=False)
     assert abs(float(found.parameters[0])) < 1e-6
@@ -101,7 +101,10 @@ def test_a_delay_of_one_output_of_two_leaves_the_clock_free():
     both = Recording({"time": simulator()["time"], "y": simulator()["y"], "z": simulator()["y"].square()})
     recording = recorded(signal(times()), z=signal(times()).square() + 0.01)
     prepared = Paired(both).prepare(recording)
-    alone, together = late(prepared, Delay()).prior.precision, late(prepared, CommonDelay(), "all outputs").prior
+    alone, together = (
+        with_effect(prepared, Delay()).prior.precision,
+        with_effect(prepared, CommonDelay(), "all outputs").prior,
+    )
     assert torch.equal(alone[:2], prepared.prior.precision)
     assert float(together.precision[0, 0] / prepared.prior.precision[0]) > 1e6
     apart = JointModel(prepared, tuple(Term(Delay(), None, {}, f"output {name}") for name in "yz"))
@@ -114,7 +117,7 @@ def test_with_a_delay_only_the_mean_clock_offset_of_runs_is_held():
         return Recording(columns | {"experiment": torch.arange(2.0).double().repeat_interleave(len(table))})
 
     prepared = Paired(twice(simulator())).prepare(twice(recorded(signal(times()))))
-    precision = late(prepared, Delay()).prior.precision
+    precision = with_effect(prepared, Delay()).prior.precision
     known = float(prepared.prior.precision[0])
     apart, mean = (precision.new_tensor(row) for row in ([1.0, -1.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0]))
     assert float(apart @ precision @ apart) == pytest.approx(2.0 * known, rel=1e-6)
@@ -124,7 +127,7 @@ def test_with_a_delay_only_the_mean_clock_offset_of_runs_is_held():
 
 def test_a_drift_is_complete_and_the_clock_rate_is_held():
     prepared = Paired(simulator()).prepare(recorded(signal(1.002 * times())))
-    found = fitted(late(prepared, ClockDrift(), "all outputs"), torch.tensor([0.0, 5e-5, 0.0019]).double())
+    found = fitted(with_effect(prepared, ClockDrift(), "all outputs"), torch.tensor([0.0, 5e-5, 0.0019]).double())
     assert abs(float(found.parameters[1])) < 1e-8
 
 
@@ -138,7 +141,7 @@ def test_the_correction_uses_the_fitted_clocks():
     assert torch.allclose(older(Recording({"time": times()}))["y"], signal(times()), atol=1e-3)
 
 
-def test_interpolation_of_a_smooth_signal_and_its_slope():
+def test_interpolation_reproduces_a_smooth_signal_and_its_slope():
     load_forward_mode()
     prepared = Paired(simulator(0.2)).prepare(recorded(signal(times())))
     at = times() + 0.013
@@ -148,7 +151,7 @@ def test_interpolation_of_a_smooth_signal_and_its_slope():
     torch.testing.assert_close(slope, expected, rtol=0.0, atol=0.06)
 
 
-def test_derivatives_of_the_residual():
+def test_derivatives_of_the_residual_agree_with_finite_differences():
     load_forward_mode()
     prepared = Paired(simulator()).prepare(recorded(signal(times())))
     theta = torch.tensor([0.004, 2e-5], dtype=torch.float64)
@@ -160,7 +163,7 @@ def test_derivatives_of_the_residual():
         torch.testing.assert_close(forward[..., k], near, rtol=1e-4, atol=1e-4 * float(near.abs().max()))
 
 
-def test_columns_that_are_the_same_are_inputs():
+def test_equal_columns_of_both_tables_are_inputs():
     table = recorded(signal(times()))
     exact = Recording({"time": times(), "y": table["y"], "torque": torch.cos(times())})
     same = Recording({"time": times(), "y": signal(times()), "torque": torch.cos(times())})

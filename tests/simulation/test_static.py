@@ -93,7 +93,7 @@ def test_a_module_predicts_the_same_values():
         assert torch.equal(values.double(), module.state_dict()[name].double())
 
 
-def test_without_time_and_with_units():
+def test_a_recording_without_time_has_sample_numbers_units_and_bounds():
     table = recording()
     prepared = Thermistor().prepare(Recording({name: table[name] for name in ("temperature", "voltage")}))
     assert prepared.unit == "V"
@@ -117,7 +117,7 @@ def test_parameters_that_the_data_cannot_determine_are_named():
     assert Thermistor().prepare(recording()).warnings == ()
 
 
-class Odd(Thermistor):
+class StaticReturning(Thermistor):
     def __init__(self, value):
         super().__init__()
         self.value = value
@@ -135,12 +135,12 @@ class Odd(Thermistor):
         (lambda u: {"voltage": (u.temperature - 20.5).log()}, "is nan at time .* parameters bottom = 0.3"),
     ],
 )
-def test_outputs_that_cannot_be_used(value, words):
+def test_invalid_outputs_are_refused_with_the_reason(value, words):
     with pytest.raises(SimulationError, match=words):
-        Odd(value).prepare(recording())
+        StaticReturning(value).prepare(recording())
 
 
-def test_modules_that_cannot_be_used():
+def test_invalid_modules_and_columns_are_refused_with_the_reason():
     line = torch.nn.Linear(1, 2)
     with pytest.raises(
         SimulationError, match=r"shape \(300, 1\), a column for each of voltage, but it returns \(300, 2\)"

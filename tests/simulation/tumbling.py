@@ -40,7 +40,7 @@ def tumbling(
     moments=None,
     **columns,
 ):
-    """A recording; ``sensor`` (N, 3) in µT is added to the measurement, ``columns`` to the table.
+    """Return a recording; ``sensor`` (N, 3) in µT is added to the measurement, ``columns`` to the table.
 
     ``moments`` (N,) in s are the times of the motion, if they differ from the times of the samples.
     """
@@ -69,14 +69,14 @@ def resting(N, first, last, rate=RATE):
 
 
 def changed(recording, **columns):
-    """The recording with columns replaced, added, or (None) removed."""
+    """Return the recording with columns replaced, added, or (None) removed."""
     table = {name: values for name, values in recording.columns.items() if columns.get(name, 0) is not None}
     added = {name: torch.as_tensor(values) for name, values in columns.items() if values is not None}
     return Recording(table | added, name=recording.name)
 
 
 def true_matrix(strength):
-    """The calibration matrix for an ambient field of this strength."""
+    """Return the calibration matrix for an ambient field of this strength."""
     return np.linalg.inv(RESPONSE) * (strength / np.linalg.norm(FIELD))
 
 

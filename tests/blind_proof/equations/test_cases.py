@@ -15,28 +15,28 @@ from examples.blind_proof.key import canonical
 from mkc_torch.simulation import Dynamics, Static
 from mkc_torch.simulation.load import load_simulation
 
-FIRST_OF_EACH = {"pendulum": 0, "servo": 1, "tanks": 2, "projectile": 4}
+FIRST_INDEX = {"pendulum": 0, "servo": 1, "tanks": 2, "projectile": 4}
 
 
 @pytest.fixture(scope="module")
 def cases():
-    return {name: draw(1, index) for name, index in FIRST_OF_EACH.items()}
+    return {name: draw(1, index) for name, index in FIRST_INDEX.items()}
 
 
 @pytest.mark.e2e
 def test_the_same_address_gives_the_same_case(cases):
-    again = draw(1, FIRST_OF_EACH["tanks"])
+    again = draw(1, FIRST_INDEX["tanks"])
     assert canonical([again.key]) == canonical([cases["tanks"].key])
     for name, values in cases["tanks"].recording.columns.items():
         torch.testing.assert_close(again.recording[name], values, rtol=0, atol=0)
 
 
-def test_names_reveal_only_the_system(cases):
+def test_recording_names_reveal_the_system_only(cases):
     for name, case in cases.items():
-        assert case.recording.name == f"{name}_{FIRST_OF_EACH[name]:05d}"
+        assert case.recording.name == f"{name}_{FIRST_INDEX[name]:05d}"
 
 
-def test_keys_survive_json_and_have_the_detectability(cases):
+def test_keys_round_trip_through_json_with_their_detectability(cases):
     for case in cases.values():
         assert json.loads(canonical([case.key])) == [case.key.numbers()]
         (effect,) = case.key.effects
@@ -46,7 +46,7 @@ def test_keys_survive_json_and_have_the_detectability(cases):
         assert 0.7 < case.key.oracle_rms < 1.3
 
 
-def test_recordings_have_runs_outliers_and_columns_that_mean_nothing(cases):
+def test_recordings_have_runs_outliers_and_an_unrelated_column(cases):
     for case in cases.values():
         recording = case.recording
         assert 300 <= len(recording) <= 600
@@ -58,15 +58,15 @@ def test_recordings_have_runs_outliers_and_columns_that_mean_nothing(cases):
 
 
 def test_an_empty_case_hides_nothing():
-    case = draw(1, FIRST_OF_EACH["tanks"], hidden=False)
+    case = draw(1, FIRST_INDEX["tanks"], hidden=False)
     assert case.key.effects == ()
     assert case.second is None
     assert case.key.kind == "empty"
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
-def test_a_user_could_have_written_the_simulation(system):
-    """It is given as `mkc diagnose --simulation FILE.py:CLASS` takes it, and it is the plant without what is hidden."""
+def test_the_simulation_has_the_equations_of_the_plant_without_the_effect(system):
+    """It is loaded from a file as `mkc diagnose --simulation FILE.py:CLASS` does."""
     setting = SYSTEMS[system].draw(generator(3, system))
     plant = setting.plant
     simulation = load_simulation(f"{MODELS}:{class_of(system)}")
@@ -94,8 +94,8 @@ def test_a_user_could_have_written_the_simulation(system):
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
-def test_the_true_run_is_as_good_as_the_oracle(cases):
-    """What the sensors added is all that the true system leaves."""
+def test_the_residual_of_the_true_system_is_that_of_the_sensor_errors(cases):
+    """The true system leaves the sensor errors only."""
     case = cases["tanks"]
     key, second = case.key, case.second
     good = np.ones(2 * len(second), dtype=bool)
@@ -118,7 +118,7 @@ def test_errors_have_their_declared_size_and_correlation():
     assert np.corrcoef(noise[0, 1:], noise[0, :-1])[0, 1] == pytest.approx(0.4, abs=0.03)
 
 
-def test_outliers_are_far_and_few():
+def test_outliers_are_large_and_of_the_declared_share():
     errors = Errors((0.5,), 0.0, "gaussian")
     bad, mask = contaminate(generator(6), errors, 400, 2)
     assert mask.sum() == 2 * round(OUTLIERS * 400)

@@ -28,7 +28,7 @@ from examples.blind_proof.equations.systems import SYSTEMS
 STEP, FINE = 0.05, 8
 
 
-def trial(samples, runs=2):
+def run_set(samples, runs=2):
     return RunSet(STEP, np.zeros((0, samples, runs)), np.zeros((1, runs)))
 
 
@@ -39,7 +39,7 @@ def scene_of(system, seed=3):
 
 
 def test_white_force_noise_is_independent_and_its_integral_does_not_depend_on_the_fine_step():
-    values = white(generator(1), trial(501, 40), FINE).fine
+    values = white(generator(1), run_set(501, 40), FINE).fine
     count = values.size
     lags = [(values[k:] * values[:-k]).mean() / values.var() for k in (1, 2, 8)]
     assert np.abs(lags).max() < 4.0 / np.sqrt(count)
@@ -47,12 +47,12 @@ def test_white_force_noise_is_independent_and_its_integral_does_not_depend_on_th
     thirds = [part.mean() for part in np.array_split(power, 3)]
     np.testing.assert_allclose(thirds, 1.0, rtol=0.03)
     for fine in (2, 16):
-        steps = white(generator(1), trial(501, 40), fine).fine.reshape(500, fine, 40).sum(1) * STEP / fine
+        steps = white(generator(1), run_set(501, 40), fine).fine.reshape(500, fine, 40).sum(1) * STEP / fine
         assert steps.var() / STEP == pytest.approx(1.0, rel=0.03)
 
 
 def test_a_slow_disturbance_decorrelates_exponentially():
-    many = slow(generator(2), trial(200, 4000), 2)  # the correlation over an ensemble
+    many = slow(generator(2), run_set(200, 4000), 2)  # the correlation over an ensemble
     constant = many.words["correlation time"]
     assert SLOW[0] <= constant / (199 * STEP) <= SLOW[1]
     values = many.fine[::2]
@@ -64,7 +64,7 @@ def test_a_slow_disturbance_decorrelates_exponentially():
 
 
 def test_a_lasting_disturbance_decorrelates_within_about_a_run():
-    many = KINDS["lasting_push_runs"](generator(2), trial(100, 4000), 1)
+    many = KINDS["lasting_push_runs"](generator(2), run_set(100, 4000), 1)
     constant = many.words["correlation time"]
     assert LASTING[0] <= constant / (99 * STEP) <= LASTING[1]
     found = (many.fine[60:] * many.fine[:-60]).mean()
@@ -72,7 +72,7 @@ def test_a_lasting_disturbance_decorrelates_within_about_a_run():
 
 
 def test_gusts_are_level_in_some_stretches_and_absent_in_others():
-    values = gusts(generator(3), trial(401, 50), FINE).fine
+    values = gusts(generator(3), run_set(401, 50), FINE).fine
     assert not np.diff(values.reshape(400, FINE, 50), axis=1).any()
     calm = (values == 0.0).mean(0)
     assert (calm > 0.2).all()

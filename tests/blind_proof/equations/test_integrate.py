@@ -11,14 +11,14 @@ from examples.blind_proof.equations.systems import SYSTEMS
 DRAWS = {name: system.draw for name, system in SYSTEMS.items() if name != "servo"}
 
 
-def short(trial, samples=60):
+def shortened(trial, samples=60):
     return RunSet(trial.step, trial.inputs[:, :samples], trial.begin)
 
 
 @pytest.mark.parametrize("name", DRAWS)
-def test_agrees_with_an_adaptive_method(name):
+def test_simulate_agrees_with_an_adaptive_method(name):
     setting = DRAWS[name](generator(1, name))
-    plant, trial = setting.plant, short(setting.trial)
+    plant, trial = setting.plant, shortened(setting.trial)
     found = simulate(plant, trial).states[:, :: plant.fine]
     time = trial.step * np.arange(trial.samples)
 
@@ -26,15 +26,15 @@ def test_agrees_with_an_adaptive_method(name):
         u = np.array([np.interp(t, time, item[:, 0]) for item in trial.inputs])
         return plant.rate(x[:, None], u[:, None], plant.values)[:, 0]
 
-    stated_diagnosis = solve_ivp(rate, (0.0, time[-1]), trial.begin[:, 0], t_eval=time, rtol=1e-9, atol=1e-10,
+    reference = solve_ivp(rate, (0.0, time[-1]), trial.begin[:, 0], t_eval=time, rtol=1e-9, atol=1e-10,
                        max_step=trial.step)  # fmt: skip
-    scale = np.abs(stated_diagnosis.y).max(1, keepdims=True)
-    assert np.abs(found[..., 0] - stated_diagnosis.y).max() < 1e-5 * scale.max()
+    scale = np.abs(reference.y).max(1, keepdims=True)
+    assert np.abs(found[..., 0] - reference.y).max() < 1e-5 * scale.max()
 
 
 def test_parallel_sizes_equal_single_sizes():
     setting = SYSTEMS["pendulum"].draw(generator(2))
-    trial = short(setting.trial)
+    trial = shortened(setting.trial)
     hidden = HiddenTerm("coulomb_friction", "", ("rate of speed",), 1.0, bristles(1, 0.02, 1.0), own=1)
     sizes = np.array([0.0, 0.1, 0.4])
     together = outputs_of_sizes(setting.plant, trial, hidden, sizes)
@@ -42,14 +42,14 @@ def test_parallel_sizes_equal_single_sizes():
         np.testing.assert_allclose(found, simulate(setting.plant, trial, hidden, float(size)).outputs, rtol=1e-12)
 
 
-def test_nothing_hidden_is_size_zero():
+def test_a_hidden_effect_of_size_zero_changes_nothing():
     setting = SYSTEMS["pendulum"].draw(generator(3))
     hidden = HiddenTerm("coulomb_friction", "", ("rate of speed",), 1.0, bristles(1, 0.02, 1.0), own=1)
     there = simulate(setting.plant, setting.trial, hidden, 0.0).outputs
     np.testing.assert_array_equal(there, simulate(setting.plant, setting.trial).outputs)
 
 
-def test_between_is_linear():
+def test_between_interpolates_linearly():
     values = np.arange(12.0).reshape(1, 4, 3) ** 2
     found = between(values, 4)
     np.testing.assert_allclose(found[:, ::4], values)

@@ -30,8 +30,8 @@ def errors_of(scene, correlation=0.3):
     return Errors(tuple(0.01 * item.std() for item in scene.course.outputs), correlation, "gaussian")
 
 
-def dense(errors, shape):
-    """Inverse root of the covariance of (m, T, R) outputs, built from it as it stands."""
+def dense_whitening(errors, shape):
+    """Return the inverse Cholesky factor of the dense covariance of (m, T, R) outputs."""
     m, samples, runs = shape
     lag = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
     root = np.linalg.inv(np.linalg.cholesky(errors.correlation**lag))
@@ -43,19 +43,19 @@ def dense(errors, shape):
     return total
 
 
-def by_differences(change):
-    """Derivative of the outputs by what ``change(step)`` simulates."""
+def finite_difference(change):
+    """Return the central difference of ``change(step)``, simulated outputs, by the step."""
     return (change(1e-5) - change(-1e-5)) / 2e-5
 
 
-def test_whitening_is_that_of_the_dense_covariance(scene):
+def test_whitening_equals_that_of_the_dense_covariance(scene):
     errors = errors_of(scene)
     trace = np.random.default_rng(0).standard_normal((*scene.course.outputs.shape, 2))
-    expected = dense(errors, trace.shape[:3]) @ trace.reshape(-1, 2)
+    expected = dense_whitening(errors, trace.shape[:3]) @ trace.reshape(-1, 2)
     np.testing.assert_allclose(errors.whitened(trace), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_tangents_are_finite_differences_of_the_simulation(scene):
+def test_tangents_equal_finite_differences_of_the_simulation(scene):
     errors = errors_of(scene, 0.0)
     known = tangents(scene, errors, rivals=False).known
     for k in range(known.shape[1]):
@@ -65,7 +65,7 @@ def test_tangents_are_finite_differences_of_the_simulation(scene):
             away[k] = step
             return simulate(*moved(scene.plant, scene.trial, away)).outputs
 
-        expected = errors.whitened(by_differences(change))
+        expected = errors.whitened(finite_difference(change))
         assert np.abs(known[:, k] - expected).max() < 1e-3 * np.abs(expected).max()
 
 
@@ -77,20 +77,22 @@ def test_rival_forms_equal_finite_differences_of_the_simulation():
              "cubic_stiffness": lambda x, _: -x[0] ** 3}  # fmt: skip
     for effect, form in forms.items():
         hidden = HiddenTerm(effect, "", (rate_of("speed"),), 1.0, added(1, form))
-        expected = errors.whitened(by_differences(lambda s, h=hidden: simulate(scene.plant, scene.trial, h, s).outputs))
+        expected = errors.whitened(
+            finite_difference(lambda s, h=hidden: simulate(scene.plant, scene.trial, h, s).outputs)
+        )
         np.testing.assert_allclose(
             found[effect, (rate_of("speed"),)][:, 0], expected, atol=2e-3 * np.abs(expected).max()
         )
 
 
-def test_z_is_that_of_a_dense_projection(scene):
-    """A small effect, against its own textbook sum."""
+def test_z_equals_that_of_a_dense_projection(scene):
+    """A small effect, compared with the explicit sum."""
     errors = errors_of(scene)
     row = scene.plant.states.index("speed") if "speed" in scene.plant.states else 0
     place = rate_of(scene.plant.states[row])
     hidden = HiddenTerm("constant_force", "", (place,), 1.0, added(row, lambda x, _: np.ones_like(x[row])))
     size = 0.02 * scene.pace(scene.plant.states[row])
-    root = dense(errors, scene.course.outputs.shape)
+    root = dense_whitening(errors, scene.course.outputs.shape)
     delta = root @ (simulate(scene.plant, scene.trial, hidden, size).outputs - scene.course.outputs).ravel()
     known = tangents(scene, errors, rivals=False).known
     rest = delta - known @ np.linalg.lstsq(known, delta, rcond=None)[0]
@@ -102,14 +104,14 @@ def test_z_is_that_of_a_dense_projection(scene):
     assert all(rival.effect != "constant_force" or rival.at != (place,) for rival in found.rivals)
 
 
-def test_what_a_refit_absorbs_is_invisible():
+def test_an_effect_that_a_refit_absorbs_has_zero_z():
     scene = short_scene(PENDULUM, 6)
     hidden = HiddenTerm("linear_drag", "", (rate_of("speed"),), 1.0, added(1, lambda x, _: -x[1]))
     found = power(scene.plant, scene.trial, hidden, 0.05, errors_of(scene))
     assert found.z < 1e-2
 
 
-def test_an_account_that_contains_the_own_form_is_no_rival():
+def test_a_form_that_contains_the_hidden_form_is_not_a_rival():
     scene = short_scene(PENDULUM, 7)
     width = 0.1 * scene.typical("speed")
     hidden = HiddenTerm("coulomb_friction", "", (rate_of("speed"),), 1.0, added(1, lambda x, _: -np.tanh(x[1] / width)))
@@ -118,7 +120,7 @@ def test_an_account_that_contains_the_own_form_is_no_rival():
     assert found.z_sep > 1.0
 
 
-def test_linear_forms_are_compared_to_first_order():
+def test_z_is_linear_in_a_small_size():
     scene = short_scene(TANKS, 8)
     errors = errors_of(scene)
     hidden = HiddenTerm("overflow", "", (rate_of("level_1"),), 1.0, weir(0, 0.7 * scene.largest("level_1"), 1.5))

@@ -1,4 +1,4 @@
-"""A system without states: its outputs are read off its inputs, and what they lack has the names of outputs."""
+"""A system without states: its outputs are functions of its inputs, and its effects act on inputs or outputs."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_the_angle_is_the_command_times_its_scale(scene):
     np.testing.assert_allclose(tangent[:, 0], expected, rtol=1e-6, atol=1e-9)
 
 
-def test_what_is_hidden_at_an_input_or_an_output_reaches_the_angle(scene):
+def test_a_shift_of_the_input_is_scaled_and_a_shift_of_the_output_is_not(scene):
     def shifted(values, step, size):
         return values + size
 
@@ -41,7 +41,7 @@ def test_what_is_hidden_at_an_input_or_an_output_reaches_the_angle(scene):
         np.testing.assert_allclose(found - scene.course.outputs, 0.5 * factor, rtol=1e-9)
 
 
-def test_forms_are_what_the_effects_of_small_size_do(scene):
+def test_forms_are_the_derivatives_of_the_effects_at_size_zero(scene):
     found = {(item.effect, item.at): item for item in readings(scene)}
     level = found["offset", ("angle",)].outputs
     np.testing.assert_array_equal(level, 1.0)
@@ -53,7 +53,7 @@ def test_forms_are_what_the_effects_of_small_size_do(scene):
     assert np.abs(left).max() < 1e-4
 
 
-def test_each_name_is_at_the_angle_or_at_the_command(scene):
+def test_names_of_effects_belong_to_the_angle_or_the_command(scene):
     known = names(scene)
     assert {"offset", "gravity_sag", "delay", "backlash", "output_saturation", "sensor_lag", "clock_drift"} <= {
         effect for effect, at in known if at == ("angle",)
@@ -70,7 +70,7 @@ def test_the_same_delay_of_the_command_is_inseparable_and_not_a_rival(scene):
     assert seen.z > 10.0
 
 
-def test_the_true_system_leaves_what_the_sensor_added(scene):
+def test_the_oracle_residual_of_the_true_system_is_the_sensor_error(scene):
     errors = errors_of(scene)
     left = np.random.default_rng(1).standard_normal(scene.course.outputs.shape) * errors.deviations[0]
     hidden = load(generator(3), scene)

@@ -110,8 +110,8 @@ def test_a_held_input_is_held_in_the_integration(held):
 
 
 @pytest.mark.e2e
-def test_the_scenario_of_held_inputs_differs_from_its_linear_twin_by_more_than_its_noise():
-    """Otherwise the scenario would test nothing."""
+def test_held_inputs_differ_from_linear_inputs_by_more_than_the_noise():
+    """The scenario is void if the noise hides the difference."""
     from dataclasses import replace
 
     more = []
@@ -159,7 +159,7 @@ def test_a_sensor_drifts_for_one_to_ten_per_cent_of_a_run_without_disturbance(hi
         assert max(item["over_noise"] for item in slow.values()) == key.disturbance.over_noise
 
 
-def test_runs_are_several_and_throws_have_nothing_to_hold():
+def test_recordings_have_three_to_five_runs_and_throws_no_held_input():
     for index in range(6):
         recording = SCENARIOS["runs"].draw(3, index, False, index).recording
         assert 3 <= len(recording["experiment"].unique()) <= 5
@@ -185,7 +185,7 @@ def test_far_starts_are_ten_times_off(index, tmp_path):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("index", range(6))
-def test_a_useless_simulation_follows_no_output_of_the_recording(index):
+def test_a_useless_simulation_fits_no_output_of_the_recording(index):
     """A fit to the recorded outputs from other starts does not explain a quarter of any output either."""
     case = SCENARIOS["useless"].draw(5, index, False, index)
     assert case.key.useless == ("wrong sign", "another system", "unrelated output")[index % 3]
@@ -204,7 +204,7 @@ def test_a_useless_simulation_follows_no_output_of_the_recording(index):
     assert max(best_shares(generator(77), guess, trial, outputs)) <= MOST_EXPLAINED + 0.02
 
 
-def test_a_draw_of_which_any_fit_follows_an_output_is_drawn_again(monkeypatch):
+def test_a_useless_draw_that_a_fit_can_explain_is_drawn_again(monkeypatch):
     reported = iter([[0.1, 0.9], [0.1, 0.2], [0.26, -3.0], *[[0.2, -5.0]] * 4])
     monkeypatch.setattr(sys.modules[draw_useless.__module__], "best_shares", lambda *_: next(reported))
     assert draw_useless(3, 0, False, 0).key.explained == 0.2
@@ -212,21 +212,21 @@ def test_a_draw_of_which_any_fit_follows_an_output_is_drawn_again(monkeypatch):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("system", sorted({*SYSTEMS} - {"servo"}))
-def test_the_right_simulation_can_follow(system):
+def test_the_true_simulation_explains_all_outputs(system):
     """A small share then means a useless simulation, not a poor fit."""
     setting = SYSTEMS[system].draw(generator(5, system))
     outputs = simulate(setting.plant, setting.trial).outputs
     assert min(best_shares(generator(6), right(setting.plant), setting.trial, outputs)) > 0.995
 
 
-class Names:
+class Attributes:
     def __init__(self, names, values):
         self.__dict__.update(zip(names, values, strict=True))
 
 
 @pytest.mark.parametrize("kind", ["wrong sign", "another system"])
 @pytest.mark.parametrize("system", sorted({*SYSTEMS} - {"servo"}))
-def test_what_the_diagnosis_is_given_is_what_the_generator_tried(system, kind, tmp_path):
+def test_the_simulation_file_has_the_equations_that_the_generator_fitted(system, kind, tmp_path):
     setting = SYSTEMS[system].draw(generator(3, system))
     guess = wrong(setting.plant, kind)
     plant, name = guess.plant, "".join(word.capitalize() for word in system.split("_"))
@@ -244,7 +244,10 @@ def test_what_the_diagnosis_is_given_is_what_the_generator_tried(system, kind, t
     u = torch.rand(len(plant.inputs), 7, generator=generator(2), dtype=torch.float64)
     values = 0.5 + torch.rand(len(guess.starts), generator=generator(3), dtype=torch.float64)
     rates = simulation.derivative(
-        torch.zeros(7), Names(plant.states, x), Names(plant.inputs, u), Names(simulation.parameters, values)
+        torch.zeros(7),
+        Attributes(plant.states, x),
+        Attributes(plant.inputs, u),
+        Attributes(simulation.parameters, values),
     )
     expected = plant.rate(x.numpy(), u.numpy(), values.numpy())
     found = np.stack([(rates[state] + torch.zeros(7)).numpy() for state in plant.states])

@@ -19,19 +19,19 @@ def cases():
     return [draw(DURATION, 5, k) for k in range(COUNT)]
 
 
-def same(first, second):
+def same_recording(first, second):
     return first.names == second.names and all(first[name].equal(second[name]) for name in first.names)
 
 
 def test_the_same_address_gives_the_same_case(cases):
     again = draw(DURATION, 5, 3)
-    assert same(again.recording, cases[3].recording)
-    assert same(again.second, cases[3].second)
+    assert same_recording(again.recording, cases[3].recording)
+    assert same_recording(again.second, cases[3].second)
     assert again.key == cases[3].key
 
 
 def test_other_addresses_give_other_cases(cases):
-    assert not same(draw(DURATION, 6, 3).recording, cases[3].recording)
+    assert not same_recording(draw(DURATION, 6, 3).recording, cases[3].recording)
 
 
 def test_empty_cases_have_the_same_columns_and_no_effect(cases):
@@ -43,7 +43,7 @@ def test_empty_cases_have_the_same_columns_and_no_effect(cases):
         assert empty.second is None
 
 
-def test_hidden_and_empty_differ_by_the_effect_alone(cases):
+def test_hidden_and_empty_cases_differ_by_the_effect_only(cases):
     case = next(case for case in cases if case.key.effects[0].effect == "hard_iron_step" and case.key.kind == "single")
     empty = draw(DURATION, 5, int(case.key.name[-5:]), hidden=False)
     change = case.recording.magnetometer() - empty.recording.magnetometer()
@@ -77,7 +77,7 @@ def test_names_of_columns_do_not_reveal_the_driver(cases):
         assert others == {f"aux_{k}" for k in range(1, len(others) + 1)} == set(case.key.decoys)
 
 
-def test_modes_come_in_their_shares(cases):
+def test_modes_have_their_declared_shares(cases):
     modes = Counter(case.key.mode for case in cases)
     assert modes["norm"] > modes["attitude"] > 0
     for case in cases:

@@ -16,7 +16,7 @@ from examples.blind_proof.magnetometer.hidden import (
     wire_field,
 )
 
-EVERYTHING = {**CATALOGUE, **OUTSIDE}
+ALL_EFFECTS = {**CATALOGUE, **OUTSIDE}
 
 
 @pytest.fixture(scope="module")
@@ -24,11 +24,11 @@ def scene():
     return draw_scene(generator(0), 20.0)
 
 
-@pytest.mark.parametrize("effect", EVERYTHING)
+@pytest.mark.parametrize("effect", ALL_EFFECTS)
 def test_traces_are_finite_and_named(effect, scene):
     later = later_scene(generator(1), scene)
     for k in range(5):
-        hidden = EVERYTHING[effect](generator(2, k), scene)
+        hidden = ALL_EFFECTS[effect](generator(2, k), scene)
         assert hidden.effect == effect
         for at in (scene, later):
             trace = hidden.trace(at)
@@ -38,8 +38,8 @@ def test_traces_are_finite_and_named(effect, scene):
 
 
 @pytest.mark.parametrize("effect", ["hard_iron_step", "offset_drift"])
-def test_what_happened_once_holds_later(effect, scene):
-    hidden = EVERYTHING[effect](generator(3), scene)
+def test_a_step_and_a_drift_keep_their_final_offset_in_later_recordings(effect, scene):
+    hidden = ALL_EFFECTS[effect](generator(3), scene)
     end = hidden.trace(scene)[-1]
     later = hidden.trace(dataclasses.replace(scene, settled=True))
     assert float(later.std(0).max()) < 1e-12
@@ -54,7 +54,7 @@ def test_a_step_rises_about_its_onset(scene):
     assert float(size[x > 0.16].min()) > 0.9
 
 
-def test_wire_is_the_integral_of_biot_and_savart():
+def test_the_field_of_a_wire_is_the_biot_savart_integral():
     place, along, half = torch.tensor([0.03, 0.05, -0.02]).double(), torch.tensor([0.6, 0.0, 0.8]).double(), 0.1
     s = torch.linspace(-half, half, 20_001).double()
     toward = -(place + s[:, None] * along)
@@ -63,7 +63,7 @@ def test_wire_is_the_integral_of_biot_and_savart():
     torch.testing.assert_close(wire_field(place, along, half), expected, rtol=1e-6, atol=1e-9)
 
 
-def test_bar_is_a_line_of_dipoles():
+def test_the_field_of_a_bar_is_that_of_a_line_of_dipoles():
     place, axis = torch.tensor([[0.7, -0.4, 1.0]]).double(), torch.tensor([0.0, 0.6, 0.8]).double()
     moment = torch.tensor([1.0, 0.0, 0.0]).double()
     s = torch.linspace(-200.0, 200.0, 80_001).double()
@@ -71,7 +71,7 @@ def test_bar_is_a_line_of_dipoles():
     torch.testing.assert_close(bar_field(place, moment, axis)[0], expected, rtol=1e-4, atol=1e-6)
 
 
-def test_dipole_has_neither_divergence_nor_curl():
+def test_the_field_of_a_dipole_has_neither_divergence_nor_curl():
     place, moment = torch.tensor([0.3, -0.2, 0.5]).double(), torch.tensor([0.1, 0.2, -0.3]).double()
     jacobian = torch.func.jacrev(lambda p: dipole_field(p, moment))(place)
     assert abs(float(jacobian.trace())) < 1e-9 * float(jacobian.abs().max())

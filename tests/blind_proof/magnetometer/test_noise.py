@@ -18,14 +18,14 @@ from examples.blind_proof.magnetometer.noise import (
 
 
 @pytest.mark.parametrize(("family", "kurtosis"), [("gaussian", 3.0), ("laplace", 6.0), ("student", 9.0)])
-def test_families_have_variance_one_and_their_tails(family, kurtosis):
+def test_noise_families_have_unit_variance_and_their_kurtosis(family, kurtosis):
     x = unit_variance(generator(0, family), family, 400_000)
     assert float(x.var()) == pytest.approx(1.0, rel=0.02)
     # the fourth moment of Student's t with five degrees of freedom converges slowly
     assert float(x.pow(4).mean()) == pytest.approx(kurtosis, rel=0.35 if family == "student" else 0.05)
 
 
-def test_kinds_come_in_their_shares():
+def test_noise_kinds_have_their_declared_shares():
     drawn = [draw_noise(generator(1, k), 4500, 50.0) for k in range(600)]
     counts = Counter(noise.kind for noise in drawn)
     for kind, share in zip(KINDS, KIND_SHARES, strict=True):
@@ -43,7 +43,7 @@ def test_errors_have_the_stated_size(kind):
     assert bool((errors.std(0) < largest * noise.sigma).all() and (errors.std(0) > 0.3 * noise.sigma).all())
 
 
-def test_a_walk_goes_half_to_five_sigmas():
+def test_an_offset_walk_reaches_half_to_five_sigmas():
     walks = [n for k in range(300) if "walk" in (n := draw_noise(generator(4, k), 4500, 50.0)).kind and n.walks]
     assert {n.kind for n in walks} == {"offset walk", "ar1 and offset walk"}
     ends = [process.innovation * 4500**0.5 / n.sigma for n in walks for process in n.walks]
@@ -51,7 +51,7 @@ def test_a_walk_goes_half_to_five_sigmas():
     assert max(ends) < 7.5
 
 
-def test_outliers_have_their_share_and_side():
+def test_one_sided_outliers_have_their_share_sign_and_size():
     up = torch.tensor([0.0, 0.0, 1.0]).double().expand(4000, 3)
     for burst in (1.0, 20.0):
         bad, mask = contaminate(generator(5), Outliers(0.15, burst, True, (5.0, 50.0)), 0.5, up)

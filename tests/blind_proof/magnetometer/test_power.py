@@ -32,7 +32,7 @@ def noise_of(kind):
 
 
 def dense_z(metric, trace, family):
-    """z and z_sep by the dense covariance."""
+    """Return z and z_sep by the dense covariance."""
     gains, processes = metric.coloured()
     root = torch.linalg.cholesky(dense_covariance(metric.white_variance(), gains, processes))
 
@@ -48,7 +48,7 @@ def dense_z(metric, trace, family):
 
 @pytest.mark.parametrize("vector", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
-def test_agrees_with_the_dense_covariance(kind, vector, scene):
+def test_z_agrees_with_the_dense_covariance(kind, vector, scene):
     metric = Metric(scene, noise_of(kind), vector)
     trace = CATALOGUE["hard_iron_step"](generator(2), scene).trace(scene)
     rival = column_family("temperature", scene.temperature)
@@ -56,7 +56,7 @@ def test_agrees_with_the_dense_covariance(kind, vector, scene):
     assert [power.z, power.rivals[0].z_sep] == pytest.approx(dense_z(metric, trace, rival), rel=1e-6)
 
 
-def test_scales_with_the_size(scene):
+def test_z_is_proportional_to_the_size(scene):
     metric = Metric(scene, noise_of("white"), False)
     trace = CATALOGUE["current_field"](generator(3), scene).trace(scene)
     known = families(scene, {"time": scene.time, "temperature": scene.temperature}, vector=False)
@@ -76,7 +76,7 @@ def test_coefficients_are_exact_for_a_linear_effect(scene):
     assert power.missed < 1e-4 * power.z
 
 
-def test_what_the_calibration_absorbs_is_invisible(scene):
+def test_an_effect_that_the_calibration_absorbs_has_zero_z(scene):
     offset = torch.tensor([1.0, 2.0, 3.0]).double().expand(len(scene.time), 3)
     coupling = scene.field @ torch.randn(3, 3, generator=generator(4)).double()
     for vector in (False, True):
@@ -84,7 +84,7 @@ def test_what_the_calibration_absorbs_is_invisible(scene):
         assert powers(metric, [Question(offset + coupling, [])], 0.0)[0].z < 1e-4
 
 
-def test_two_effects_hide_each_other(scene):
+def test_a_second_effect_reduces_the_z_of_the_first(scene):
     metric = Metric(scene, noise_of("white"), False)
     step = step_family(scene.time, 3.0).traces[..., 0]
     drift = next(iter(drift_families(scene.time))).traces[..., 0]
@@ -93,7 +93,7 @@ def test_two_effects_hide_each_other(scene):
     assert together < 0.95 * alone
 
 
-def test_white_noise_without_calibration_is_the_textbook_sum(scene):
+def test_z_in_white_noise_without_calibration_equals_the_explicit_sum(scene):
     """The norm's residual of isotropic white noise has variance sigma² uᵀu."""
     noise = dataclasses.replace(noise_of("white"), white=(0.5, 0.5, 0.5))
     metric = Metric(scene, noise, False)
@@ -111,7 +111,7 @@ def test_sensitivity_is_the_gradient_of_the_calibrated_length(scene):
     torch.testing.assert_close(scene.sensitivity, gradient)
 
 
-def test_attitude_gains_are_the_change_of_the_predicted_field(scene):
+def test_attitude_gains_are_derivatives_of_the_predicted_field(scene):
     turn = torch.tensor([1e-6, -2e-6, 0.5e-6]).double()
     attitude = product(from_vector(turn.expand(len(scene.time), 3)), scene.motion.attitude)
     turned = dataclasses.replace(scene, motion=dataclasses.replace(scene.motion, attitude=attitude))

@@ -68,7 +68,7 @@ def test_a_drift_has_its_declared_size():
     assert float((steps - plain).std()) < 0.5 * float(plain.std())
 
 
-def test_bursts_are_few_and_short_and_nothing_is_between_them():
+def test_bursts_are_few_and_short_and_the_field_between_them_is_zero():
     field, mask = bursts(generator(3), 0.5, 1500, 0.02)
     assert not field[~mask].any()
     assert float(field[mask].norm(dim=-1).max()) >= 0.5 * HEIGHT[0] * 0.5
@@ -79,7 +79,7 @@ def test_bursts_are_few_and_short_and_nothing_is_between_them():
     assert key.disturbance.words["share"] * 1500 <= len(key.outliers) + 1
 
 
-def test_bursts_have_both_signs_unlike_a_passing_object():
+def test_bursts_have_both_signs():
     """A one-sided pulse has a mean of 0.9 times its root mean square."""
     shares = []
     for seed in range(30):
@@ -139,7 +139,7 @@ def test_a_wrong_or_foreign_gyroscope_does_not_fit():
     assert abs(turned_along(other, 1.0)) < 0.5
 
 
-def test_an_unrelated_field_has_no_length_of_its_own():
+def test_an_unrelated_field_has_no_constant_length():
     recording = SCENARIOS["useless"].draw(3, 0, False, 0).recording
     field = recording.stack("mag_x", "mag_y", "mag_z")
     length = (field - field.median(0).values).norm(dim=-1)

@@ -15,7 +15,7 @@ def problem(channels, white):
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_inner_products_are_those_of_the_dense_inverse_covariance(channels):
+def test_whitened_inner_products_equal_those_of_the_dense_inverse_covariance(channels):
     variance, gains, values = problem(channels, 0.3)
     flat = values.reshape(-1, 5)
     expected = flat.mT @ torch.linalg.solve(dense_covariance(variance, gains, PROCESSES), flat)
@@ -23,7 +23,7 @@ def test_inner_products_are_those_of_the_dense_inverse_covariance(channels):
     torch.testing.assert_close(white.mT @ white, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_coloured_noise_needs_no_white_part():
+def test_coloured_noise_without_a_white_part_is_whitened():
     variance, gains, values = problem(1, 0.0)
     flat = values.reshape(-1, 5)
     expected = flat.mT @ torch.linalg.solve(dense_covariance(variance, gains, PROCESSES), flat)

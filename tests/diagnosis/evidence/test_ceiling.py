@@ -1,4 +1,4 @@
-"""How far a smooth correction by all columns comes on blocks that it has not seen."""
+"""The ceiling: a smooth correction by all columns, scored on held-out blocks."""
 
 import math
 from types import SimpleNamespace
@@ -29,7 +29,7 @@ NOISE = 0.4
 
 
 def walks(count, seed=0, size=N):
-    """Columns that have nothing to do with the sensor."""
+    """Return random walks that do not influence the sensor, as columns."""
     random = np.random.default_rng(seed)
     return {f"column_{k}": np.cumsum(random.standard_normal(size)) for k in range(count)}
 
@@ -39,8 +39,8 @@ def outliers(seed=3, share=0.1):
     return 15.0 * random.standard_normal((N, 3)) * (random.random((N, 1)) < share)
 
 
-def made(sensor=0.0, *, use="norm", seed=0, **columns):
-    """Fit of the simulation alone, drivers, blocks."""
+def fitted_case(sensor=0.0, *, use="norm", seed=0, **columns):
+    """Return the fit of the simulation without effects, the drivers and the blocks."""
     recording = tumbling(N, noise=NOISE, sensor=sensor + outliers(seed + 3), seed=seed, attitude=True, **columns)
     simulation = Magnetometer(use=use)
     prepared = simulation.prepare(recording)
@@ -52,63 +52,63 @@ def made(sensor=0.0, *, use="norm", seed=0, **columns):
     )
 
 
-def gained(better, worse, blocks):
+def lower_end_of_gain(better, worse, blocks):
     difference = better.log_likelihood - worse.log_likelihood
     return gain_interval(difference, blocks.block, torch.Generator().manual_seed(0))[1][0]
 
 
-def along(trace):
+def sensor_change(trace):
     return GAIN * trace[:, None]
 
 
 @pytest.fixture(scope="module")
-def empty():
-    fit, drivers, blocks = made(load=LOAD, **walks(4))
+def ceiling_of_noise():
+    fit, drivers, blocks = fitted_case(load=LOAD, **walks(4))
     return held_out(fit, blocks), ceiling(fit.model, fit, drivers, blocks), blocks
 
 
 @pytest.mark.parametrize("curve", [lambda x: 2.0 * x, lambda x: 4.0 * x**3 - 2.0 * x, lambda x: np.sin(3.0 * x)])
-def test_a_curve_of_a_column_is_reached(curve, empty):
-    fit, drivers, blocks = made(along(curve(LOAD)), load=LOAD, **walks(4))
+def test_the_ceiling_includes_a_nonlinear_effect_of_a_column(curve, ceiling_of_noise):
+    fit, drivers, blocks = fitted_case(sensor_change(curve(LOAD)), load=LOAD, **walks(4))
     found, alone = ceiling(fit.model, fit, drivers, blocks), held_out(fit, blocks)
     assert found.columns == ("load",)
-    assert gained(found.evidence, alone, blocks) > 0.05
-    # nearly as good as where there was nothing to find
-    nothing = float(empty[0].log_likelihood.mean())
+    assert lower_end_of_gain(found.evidence, alone, blocks) > 0.05
+    # nearly as good as on a recording without an effect
+    nothing = float(ceiling_of_noise[0].log_likelihood.mean())
     assert float(found.evidence.log_likelihood.mean()) == pytest.approx(nothing, abs=0.1)
     assert float(found.evidence.d[0]) == pytest.approx(NOISE, rel=0.15)
 
 
-def test_it_is_reached_in_a_vector_with_a_prior():
-    fit, drivers, blocks = made(along(LOAD), use="attitude", load=LOAD, **walks(4))
+def test_the_ceiling_includes_an_effect_on_a_vector_with_a_prior():
+    fit, drivers, blocks = fitted_case(sensor_change(LOAD), use="attitude", load=LOAD, **walks(4))
     found = ceiling(fit.model, fit, drivers, blocks)
     assert found.columns == ("load",)
     assert found.evidence.residual.shape == (N, 3)
     np.testing.assert_allclose(found.evidence.d, NOISE, rtol=0.15)
 
 
-def test_a_drift_is_reached_without_a_column():
-    fit, drivers, blocks = made(4.0 * along(np.tanh(TIME / 10.0)), load=LOAD)
+def test_the_ceiling_includes_a_drift_without_a_column():
+    fit, drivers, blocks = fitted_case(4.0 * sensor_change(np.tanh(TIME / 10.0)), load=LOAD)
     found = ceiling(fit.model, fit, drivers, blocks)
     assert found.columns == ()
-    assert gained(found.evidence, held_out(fit, blocks), blocks) > 0.1
+    assert lower_end_of_gain(found.evidence, held_out(fit, blocks), blocks) > 0.1
 
 
-def test_noise_has_no_ceiling_above_it(empty):
-    alone, found, _ = empty
+def test_the_ceiling_of_noise_has_no_columns_and_no_gain(ceiling_of_noise):
+    alone, found, _ = ceiling_of_noise
     assert found.columns == ()
     assert float(found.evidence.log_likelihood.mean()) == pytest.approx(float(alone.log_likelihood.mean()), abs=0.003)
 
 
-def test_columns_by_the_dozen_gain_nothing_on_unseen_blocks():
-    fit, drivers, blocks = made(**walks(60, seed=1))
+def test_sixty_unrelated_columns_gain_nothing_on_held_out_blocks():
+    fit, drivers, blocks = fitted_case(**walks(60, seed=1))
     found = ceiling(fit.model, fit, drivers, blocks)
     difference = found.evidence.log_likelihood - held_out(fit, blocks).log_likelihood
     assert float(difference.mean()) < 0.005
 
 
-def test_of_columns_by_the_dozen_the_right_one_is_taken():
-    fit, drivers, blocks = made(along(LOAD), **walks(60, seed=1), load=LOAD)
+def test_the_driver_is_selected_among_sixty_unrelated_columns():
+    fit, drivers, blocks = fitted_case(sensor_change(LOAD), **walks(60, seed=1), load=LOAD)
     found = ceiling(fit.model, fit, drivers, blocks)
     assert found.columns == ("load",)
     tangents = smooth_tangents(
@@ -119,7 +119,7 @@ def test_of_columns_by_the_dozen_the_right_one_is_taken():
 
 def test_the_ceiling_given_a_model_is_that_of_its_residual():
     """The model parameters are refitted with the curves, so columns already in the model gain nothing."""
-    fit, drivers, blocks = made(along(LOAD), load=LOAD, **walks(2))
+    fit, drivers, blocks = fitted_case(sensor_change(LOAD), load=LOAD, **walks(2))
     effect = next(e for e in CATALOGUE if e.id == "driver_offset")
     model = fit.model.with_term(Term(effect, next(d for d in drivers if d.columns == ("load",)), {}))
     corrected = fitted(model, torch.cat([fit.parameters, torch.zeros(3, dtype=torch.float64)]), fit.bound)
@@ -144,8 +144,8 @@ def line_and_drivers(count):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("count", [2, 30])
-def test_a_port_that_is_not_pointwise(count):
-    """Both where all columns are made and where the promising ones have to be chosen by reverse mode."""
+def test_the_ceiling_at_a_port_that_is_not_pointwise_includes_the_driver(count):
+    """With all columns as candidates, and with a preselection of candidates by reverse mode."""
     line, drivers = line_and_drivers(count)
     fit, blocks = fitted(JointModel(line), line.start()), blocks_of(600, 3, ConfirmationSettings())
     found = ceiling(fit.model, fit, drivers, blocks)
@@ -155,7 +155,7 @@ def test_a_port_that_is_not_pointwise(count):
     np.testing.assert_allclose(found.evidence.d, 0.1, atol=0.015)
 
 
-def test_a_fold_knows_nothing_of_its_own_samples():
+def test_held_out_samples_do_not_influence_their_prediction():
     line, corrupted, blocks = Line(300), Line(300), blocks_of(300, 1, ConfirmationSettings())
     hidden = ~blocks.train[2]
     corrupted.measured[hidden] += 0.7
@@ -177,8 +177,8 @@ def test_curves_are_legendre_polynomials():
 
 
 @pytest.mark.e2e
-def test_the_diagnosis_has_it_on_the_same_samples_and_warns_of_what_remains():
-    recording = tumbling(N, noise=NOISE, sensor=along(LOAD) + outliers(), load=LOAD, **walks(2))
+def test_a_diagnosis_has_a_ceiling_and_warns_of_the_remaining_trend_along_a_column():
+    recording = tumbling(N, noise=NOISE, sensor=sensor_change(LOAD) + outliers(), load=LOAD, **walks(2))
     found = diagnose(Magnetometer(), recording, surrogates=19, max_findings=0)
     assert found.verdict == "unexplained"
     assert found.ceiling.rmse < 0.8 * found.corrected.rmse
@@ -187,30 +187,30 @@ def test_the_diagnosis_has_it_on_the_same_samples_and_warns_of_what_remains():
 
 
 @pytest.fixture(scope="module", params=range(5))
-def drifting(request):
-    """A drifting offset, and columns that drift in the same way but independently of it."""
+def drifting_offset(request):
+    """Return a drifting offset, and columns that drift in the same way but independently of it."""
     random = np.random.default_rng(100 + request.param)
     offset = 2.0 * NOISE * np.cumsum(random.standard_normal((N, 3)), 0) / np.sqrt(N)
-    fit, drivers, blocks = made(offset, seed=request.param, **walks(5, seed=request.param))
+    fit, drivers, blocks = fitted_case(offset, seed=request.param, **walks(5, seed=request.param))
     return fit, drivers, blocks, ceiling(fit.model, fit, drivers, blocks)
 
 
-def test_drifting_noise_is_not_reported_as_remaining(drifting):
-    fit, drivers, blocks, alone = drifting
+def test_drifting_noise_is_not_reported_as_remaining(drifting_offset):
+    fit, drivers, blocks, alone = drifting_offset
     corrected = held_out(fit, blocks)
-    assert gained(alone.evidence, corrected, blocks) > 0.0
+    assert lower_end_of_gain(alone.evidence, corrected, blocks) > 0.0
     assert remaining(alone, corrected, fit, drivers, blocks, 0, EvidenceSettings()) == ()
 
 
 def test_a_drifting_column_that_matters_is_distinguished_from_drifting_noise():
     random = np.random.default_rng(7)
     offset = NOISE * np.cumsum(random.standard_normal((N, 3)), 0) / np.sqrt(N)
-    fit, drivers, blocks = made(offset + along(LOAD), load=LOAD, **walks(3, seed=7))
+    fit, drivers, blocks = fitted_case(offset + sensor_change(LOAD), load=LOAD, **walks(3, seed=7))
     alone = ceiling(fit.model, fit, drivers, blocks)
     assert "load" in remaining(alone, held_out(fit, blocks), fit, drivers, blocks, 0, EvidenceSettings())
 
 
-def scores(gain, columns=("load",)):
+def ceiling_with_gain(gain, columns=("load",)):
     noise = 0.1 * torch.randn(N, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     nothing = torch.zeros(5, 0)
     return Ceiling(Evidence(gain + noise, nothing, nothing, nothing, nothing, 0.2), columns)
@@ -226,13 +226,13 @@ def scores(gain, columns=("load",)):
         (-0.05, 0.0, ("load",), ()),
     ],
 )
-def test_what_remains_gains_enough_and_more_than_time(monkeypatch, gain, by_time, columns, text):
-    monkeypatch.setattr("mkc_torch.diagnosis.evidence.remaining.ceiling", lambda *_: scores(by_time, ()))
+def test_a_remaining_column_has_a_minimum_gain_above_that_of_time(monkeypatch, gain, by_time, columns, text):
+    monkeypatch.setattr("mkc_torch.diagnosis.evidence.remaining.ceiling", lambda *_: ceiling_with_gain(by_time, ()))
     fit = SimpleNamespace(model=SimpleNamespace(terms=()))
     assert (
         remaining(
-            scores(gain, columns),
-            scores(0.0).evidence,
+            ceiling_with_gain(gain, columns),
+            ceiling_with_gain(0.0).evidence,
             fit,
             (),
             blocks_of(N, 3, ConfirmationSettings()),
@@ -244,7 +244,7 @@ def test_what_remains_gains_enough_and_more_than_time(monkeypatch, gain, by_time
 
 
 @pytest.mark.parametrize(("residual", "usable"), [(5.0, True), (2e38, False), (math.nan, False)])
-def test_no_curve_is_sought_around_a_simulation_that_runs_away_at_the_final_parameters(residual, usable):
+def test_the_ceiling_starts_from_the_baseline_if_the_final_parameters_diverge(residual, usable):
     model = SimpleNamespace(size=1, residual=lambda _: torch.tensor([[0.1], [residual]]))
     base = SimpleNamespace(model=model)
     final = SimpleNamespace(parameters=torch.tensor([1.0, 2.0]), bound=torch.tensor([1.0]))

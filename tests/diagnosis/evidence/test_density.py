@@ -1,4 +1,4 @@
-"""Whether the density of residuals is right, by their probability-integral transform and against a Student-t."""
+"""Checks of the residual density by the probability-integral transform, and against a Student-t."""
 
 import numpy as np
 import pytest
@@ -22,8 +22,8 @@ from tests.simulation.tumbling import tumbling
 N = 4500
 
 
-def checked(*channels):
-    """Of residuals, each channel with the density that is fitted to it."""
+def checks_of(*channels):
+    """Return the density checks of residuals, each channel with its fitted density."""
     residual = torch.stack([torch.as_tensor(channel) for channel in channels], -1)
     fit = fit_density(residual)
     return density_checks(
@@ -31,8 +31,8 @@ def checked(*channels):
     )
 
 
-def warned(*channels):
-    return density_warnings(checked(*channels))
+def warnings_of(*channels):
+    return density_warnings(checks_of(*channels))
 
 
 def mkc(seed):
@@ -59,21 +59,21 @@ def autoregressive(draws, phi):
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("draw", [mkc, gaussian])
-def test_residuals_of_the_density_are_not_warned_of(draw, seed):
-    assert warned(draw(seed)) == ()
+def test_residuals_drawn_from_the_density_have_no_warning(draw, seed):
+    assert warnings_of(draw(seed)) == ()
 
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("freedom", [1.0, 1.5, 2.0])
-def test_a_student_t_is_warned_of_with_its_freedom(freedom, seed):
-    (sentence,) = warned(student(seed, freedom))
+def test_student_t_residuals_have_a_warning_with_the_degrees_of_freedom(freedom, seed):
+    (sentence,) = warnings_of(student(seed, freedom))
     assert "does not describe the residuals of channel_0" in sentence
     assert f"a Student-t with {freedom:g} degrees of freedom" in sentence
     assert sentence.endswith("A misfit of the tail is not evidence of physics.")
 
 
 def test_distances_are_reported_with_and_without_a_warning():
-    right, wrong = checked(gaussian(0), student(1))
+    right, wrong = checks_of(gaussian(0), student(1))
     assert right.distance < right.allowed
     assert right.student_distance < right.allowed
     assert not right.closer
@@ -81,7 +81,7 @@ def test_distances_are_reported_with_and_without_a_warning():
     assert wrong.closer
 
 
-def test_residuals_that_are_all_zero_have_distances():
+def test_zero_residuals_have_distances():
     one = torch.ones(1, dtype=torch.float64)
     (check,) = density_checks(
         torch.zeros(50, 1, dtype=torch.float64), one, one, 10.0 * one, ["norm"], EvidenceSettings()
@@ -90,33 +90,33 @@ def test_residuals_that_are_all_zero_have_distances():
     assert check.student_distance == pytest.approx(1.0)
 
 
-def test_only_the_channels_that_are_misfit_are_named():
-    (sentence,) = warned(gaussian(0), student(1), mkc(2), student(3, 1.5))
+def test_the_warning_names_the_misfit_channels_only():
+    (sentence,) = warnings_of(gaussian(0), student(1), mkc(2), student(3, 1.5))
     assert "of channel_1, channel_3: its" in sentence
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_outliers_to_one_side_are_no_student_t(seed):
+def test_one_sided_outliers_have_no_warning(seed):
     random = np.random.default_rng(seed)
     corrupted = random.random(N) < 0.2
-    assert warned(gaussian(seed) + corrupted * (4.0 + 8.0 * random.random(N))) == ()
+    assert warnings_of(gaussian(seed) + corrupted * (4.0 + 8.0 * random.random(N))) == ()
 
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("phi", [0.9, 0.99])
-def test_samples_that_hang_together_count_for_fewer(phi, seed):
-    assert warned(autoregressive(gaussian(seed), phi)) == ()
+def test_correlated_samples_of_the_density_have_no_warning(phi, seed):
+    assert warnings_of(autoregressive(gaussian(seed), phi)) == ()
 
 
-def test_a_distance_that_many_samples_would_not_allow_is_allowed_to_few():
-    """The same misfit in a series of as many samples, each ten times over."""
+def test_the_allowed_distance_grows_as_the_effective_sample_size_falls():
+    """The same misfit in a series in which each sample is repeated ten times."""
     misfit = student(0, 1.5)
-    assert warned(misfit) != ()
-    assert warned(np.repeat(misfit[:450], 10)) == ()
+    assert warnings_of(misfit) != ()
+    assert warnings_of(np.repeat(misfit[:450], 10)) == ()
 
 
 @pytest.mark.parametrize("freedom", [1.0, 1.5, 2.0, 4.0, 10.0, 30.0])
-def test_the_distribution_function_of_a_student_t(freedom):
+def test_the_student_t_distribution_function_agrees_with_scipy(freedom):
     size = np.concatenate([np.linspace(0.0, 8.0, 60), [30.0, 1e4]])
     expected = 2.0 * stats.t(freedom).cdf(size) - 1.0
     np.testing.assert_allclose(student_cdf(torch.as_tensor(size), freedom), expected, atol=2e-4)
@@ -132,18 +132,18 @@ def test_the_student_t_fit_maximises_the_likelihood(freedom):
     assert likelihood == pytest.approx(stats.t(*best).logpdf(error).mean(), abs=2e-3)
 
 
-def test_the_distance_is_kolmogorovs():
+def test_the_kolmogorov_distance_agrees_with_scipy():
     values = np.random.default_rng(0).random(300) ** 1.3
     assert kolmogorov(torch.as_tensor(values)) == pytest.approx(stats.kstest(values, "uniform").statistic)
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.5, 0.9])
-def test_the_effective_size_of_an_autoregression(phi):
+def test_the_effective_size_of_an_autoregression_agrees_with_theory(phi):
     sizes = [effective_size(torch.as_tensor(autoregressive(gaussian(seed), phi))) for seed in range(20)]
     assert np.mean(sizes) == pytest.approx(N * (1.0 - phi) / (1.0 + phi), rel=0.2)
 
 
-def test_a_constant_has_as_many_as_it_has():
+def test_the_effective_size_of_a_constant_is_its_number_of_samples():
     assert effective_size(torch.ones(50, dtype=torch.float64)) == 50.0
 
 

@@ -26,7 +26,7 @@ def load(N):
     return np.sin(2.0 * np.pi * time / 3.7) + 0.4 * np.sin(2.0 * np.pi * time / 0.83 + 0.02 * time**2)
 
 
-def found(N, driver, effect="current_field", *, searched=None, **columns):
+def shift_of(N, driver, effect="current_field", *, searched=None, **columns):
     """Return the driver shifts of the searched effect, for a sensor that follows the driver."""
     recording = tumbling(N, noise=0.4, sensor=GAIN * driver[:, None], attitude=True, gyro=True, **columns)
     simulation = Magnetometer("attitude")
@@ -48,37 +48,37 @@ def warning(shift):
 
 
 @pytest.mark.e2e
-def test_no_shifted_copy_of_a_lively_driver_gains_as_much():
+def test_no_shifted_copy_of_an_oscillating_driver_gains_as_much():
     N = 2000
-    assert found(N, load(N), current=load(N) + 2.0) == DriverShift(38, 0, pytest.approx(10.0))
+    assert shift_of(N, load(N), current=load(N) + 2.0) == DriverShift(38, 0, pytest.approx(10.0))
 
 
 @pytest.mark.e2e
-def test_copies_of_a_ramp_do_as_well_as_the_ramp():
+def test_shifted_copies_of_a_ramp_gain_as_much_with_a_warning():
     N = 2000
     ramp = np.linspace(0.0, 3.0, N)
-    shift = found(N, ramp, "temperature_offset", temperature=ramp + 25.0)
+    shift = shift_of(N, ramp, "temperature_offset", temperature=ramp + 25.0)
     assert shift.as_good > 4
     (sentence,) = warning(shift)
     assert f"{shift.as_good} of 38 copies of load, shifted by up to 10 s, gain as much for current_field" in sentence
 
 
 @pytest.mark.e2e
-def test_where_there_is_nothing_to_shift_there_is_none():
+def test_without_a_driver_or_in_a_short_recording_there_is_no_driver_shift():
     N = 2000
     step = np.where(np.arange(N) < 900, 0.0, 1.0)
-    assert found(N, step, searched="hard_iron_step", current=load(N) + 2.0) is None
+    assert shift_of(N, step, searched="hard_iron_step", current=load(N) + 2.0) is None
     short = 390
-    assert found(short, 3.0 * load(short), current=load(short) + 2.0) is None
+    assert shift_of(short, 3.0 * load(short), current=load(short) + 2.0) is None
 
 
-def test_few_copies_are_no_reason_for_a_warning():
+def test_only_four_copies_or_more_of_38_are_warned_of():
     assert warning(DriverShift(38, 3, 20.0)) == ()
     assert len(warning(DriverShift(38, 4, 20.0))) == 1
 
 
 @pytest.mark.e2e
-def test_a_finding_of_a_diagnosis_has_it():
+def test_a_finding_of_a_diagnosis_has_a_driver_shift():
     N = 1500
     recording = tumbling(N, noise=0.4, sensor=GAIN * load(N)[:, None], current=load(N) + 2.0)
     result = diagnose(Magnetometer(), recording, surrogates=19, max_findings=1)

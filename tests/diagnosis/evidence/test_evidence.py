@@ -1,4 +1,4 @@
-"""What every test of evidence keeps to, the listed ones and those to come."""
+"""The contract of every test of evidence in the registry."""
 
 import json
 import re
@@ -39,7 +39,7 @@ def without_findings():
 
 
 def with_findings():
-    """A column that drives, and a step."""
+    """Return a case with two findings: the field of a current, and a step."""
     current = np.sin(2.0 * np.pi * TIME / 3.7) + 0.4 * np.sin(2.0 * np.pi * TIME / 0.83)
     sensor = np.outer(current, [0.9, -0.8, 0.9]) + np.outer(TIME >= 14.0, [3.0, 2.0, -3.0])
     simulation = Magnetometer("norm")
@@ -61,21 +61,21 @@ def case(request):
 
 
 @pytest.fixture(scope="module")
-def done(case):
+def precomputed(case):
     return [work() for work in precompute(case)]
 
 
 @pytest.fixture(scope="module")
-def answers(case, done):
-    return results_of_tests(case, done)
+def report(case, precomputed):
+    return results_of_tests(case, precomputed)
 
 
-def everything(answers):
-    return [*answers.of_all, *(said for each in answers.of_findings for said in each)]
+def all_results(report):
+    return [*report.of_all, *(said for each in report.of_findings for said in each)]
 
 
 def tensors(value, seen):
-    """All that can be reached."""
+    """Yield all tensors that are reachable from a value."""
     if id(value) in seen:
         return
     seen[id(value)] = value
@@ -93,70 +93,70 @@ def tensors(value, seen):
         yield from tensors(vars(value), seen)
 
 
-def test_each_is_asked_of_what_it_is_for(answers):
+def test_each_test_runs_for_the_diagnosis_or_for_each_finding(report):
     for_findings = sum(test.each_finding for test in TESTS)
-    assert len(answers.of_all) == len(TESTS) - for_findings
-    assert all(len(said) == for_findings for said in answers.of_findings)
-    assert len(answers.of_findings) == len(answers.case.found)
+    assert len(report.of_all) == len(TESTS) - for_findings
+    assert all(len(said) == for_findings for said in report.of_findings)
+    assert len(report.of_findings) == len(report.case.found)
 
 
-def test_each_has_an_id_of_its_own(answers):
-    for said in (answers.of_all, *answers.of_findings):
+def test_test_ids_are_unique_identifiers(report):
+    for said in (report.of_all, *report.of_findings):
         ids = [result.test for result in said]
         assert len(set(ids)) == len(ids)
         assert all(re.fullmatch("[a-z][a-z0-9_]*", one) for one in ids)
 
 
-def test_what_is_said_is_json_under_names_that_the_schema_knows(answers):
-    for result in everything(answers):
+def test_results_are_json_under_keys_of_the_schema(report):
+    for result in all_results(report):
         json.dumps(_json([result.content, result.keys]), allow_nan=False)
     schema = json_schema()
-    assert {key for result in answers.of_all for key in result.keys} <= set(schema["properties"])
-    of_findings = {key for said in answers.of_findings for result in said for key in result.keys}
+    assert {key for result in report.of_all for key in result.keys} <= set(schema["properties"])
+    of_findings = {key for said in report.of_findings for result in said for key in result.keys}
     assert of_findings <= set(schema["$defs"]["finding"]["properties"])
 
 
-def test_texts_are_sentences_and_lines(answers):
-    assert all(w[0].isupper() and w.endswith(".") for w in evidence_warnings(answers) if "_" not in w)
-    assert all(label and text and not text.endswith(".") for label, text in rows(everything(answers)))
-    for table in tables(everything(answers)):
+def test_warnings_are_sentences_and_rows_are_not(report):
+    assert all(w[0].isupper() and w.endswith(".") for w in evidence_warnings(report) if "_" not in w)
+    assert all(label and text and not text.endswith(".") for label, text in rows(all_results(report)))
+    for table in tables(all_results(report)):
         assert all(len(cells) == len(table.columns) for cells in table.rows)
         assert not table.note or table.note.endswith(".")
 
 
-def test_results_and_warnings_are_in_the_order_of_the_tests(answers):
-    of_all, of_findings = iter(answers.of_all), [iter(results) for results in answers.of_findings]
+def test_results_and_warnings_are_in_the_order_of_the_tests(report):
+    of_all, of_findings = iter(report.of_all), [iter(results) for results in report.of_findings]
     expected = [next(each) for test in TESTS for each in (of_findings if test.each_finding else [of_all])]
-    assert [result for _, result in answers.results] == expected
-    assert list(evidence_warnings(answers)) == [
-        warning for pair in answers.results for warning in evidence_warnings(replace(answers, results=(pair,)))
+    assert [result for _, result in report.results] == expected
+    assert list(evidence_warnings(report)) == [
+        warning for pair in report.results for warning in evidence_warnings(replace(report, results=(pair,)))
     ]
 
 
-def test_nothing_is_changed_and_nothing_else_is_drawn(case, done, answers):
-    before = [(tensor, tensor.clone()) for tensor in tensors((case, done), {})]
+def test_tests_change_neither_their_inputs_nor_the_global_random_state(case, precomputed, report):
+    before = [(tensor, tensor.clone()) for tensor in tensors((case, precomputed), {})]
     random = torch.random.get_rng_state()
-    again = results_of_tests(case, done)
-    assert rows(everything(again)) == rows(everything(answers))
-    assert [_json(result.keys) for result in everything(again)] == [
-        _json(result.keys) for result in everything(answers)
+    again = results_of_tests(case, precomputed)
+    assert rows(all_results(again)) == rows(all_results(report))
+    assert [_json(result.keys) for result in all_results(again)] == [
+        _json(result.keys) for result in all_results(report)
     ]
-    assert evidence_warnings(again) == evidence_warnings(answers)
+    assert evidence_warnings(again) == evidence_warnings(report)
     assert torch.equal(torch.random.get_rng_state(), random)
     assert before
     assert all(torch.equal(item, copy) for item, copy in before)
 
 
-def test_the_order_of_the_parts_makes_no_difference(case, answers):
+def test_results_do_not_depend_on_the_order_of_precomputation(case, report):
     works = precompute(case)
     backwards = [work() for work in reversed(works)][::-1]
     again = results_of_tests(case, backwards)
-    assert [_json([result.content, result.keys]) for result in everything(again)] == [
-        _json([result.content, result.keys]) for result in everything(answers)
+    assert [_json([result.content, result.keys]) for result in all_results(again)] == [
+        _json([result.content, result.keys]) for result in all_results(report)
     ]
 
 
-def test_a_test_has_what_went_ahead_of_it_and_the_final_parameters(case):
+def test_a_test_has_its_precomputed_value_and_the_final_parameters(case):
     def ahead(case):
         with pytest.raises(AssertionError):
             case.final

@@ -1,4 +1,4 @@
-"""Evidence on blocks that the fit has not seen."""
+"""Evidence on held-out blocks."""
 
 import math
 
@@ -40,7 +40,7 @@ def test_a_gap_separates_held_out_from_training_samples(N, correlation):
         assert int(distance.min()) > N // 100
 
 
-def test_the_gap_is_a_correlation_time_at_least():
+def test_the_gap_is_at_least_a_correlation_time():
     blocks = blocks_of(4500, 80, ConfirmationSettings())
     index = torch.arange(4500)
     for k in range(5):
@@ -72,7 +72,7 @@ def test_held_out_residuals_are_those_of_the_fit_to_the_rest(fit):
     np.testing.assert_allclose(found.d, 0.1, atol=0.015)
 
 
-def test_a_fold_knows_nothing_of_its_own_samples(fit):
+def test_held_out_samples_do_not_influence_their_prediction(fit):
     blocks = blocks_of(300, 1, ConfirmationSettings())
     corrupted = Line(300)
     hidden = ~blocks.train[2]
@@ -93,7 +93,7 @@ def test_scores_are_log_densities():
 
 
 def test_the_interval_is_that_of_block_means():
-    """Differences that are the same within a block: blocks are the samples of the bootstrap."""
+    """The differences are constant within a block: the bootstrap resamples blocks."""
     generator = torch.Generator().manual_seed(0)
     levels = torch.randn(25, generator=generator, dtype=torch.float64)
     block = torch.arange(2500) // 100
@@ -118,11 +118,11 @@ def test_blocks_of_unequal_length_count_by_their_samples():
     assert 1.05 < low < 1.1 < high < 1.15
 
 
-def test_equal_models_differ_by_nothing():
+def test_equal_models_have_a_gain_of_zero():
     assert gain_interval(torch.zeros(100), torch.arange(100) // 4, torch.Generator()) == (0.0, (0.0, 0.0))
 
 
-def test_the_interval_is_drawn_by_its_generator():
+def test_the_interval_depends_on_its_generator_only():
     difference = torch.randn(100, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     block = torch.arange(100) // 4
     first, second = (gain_interval(difference, block, torch.Generator().manual_seed(5)) for _ in range(2))

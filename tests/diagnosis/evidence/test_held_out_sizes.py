@@ -73,14 +73,14 @@ def test_a_block_in_which_one_model_diverges_is_excluded_for_all():
     assert torch.equal(kept, (BLOCKS.block != 3) & (BLOCKS.block != 20))
 
 
-def test_a_fifth_of_outliers_is_no_divergence():
+def test_a_block_with_a_fifth_of_outliers_is_not_diverged():
     """The recorded range is 2 rad."""
     quiet = noise(0.1, 3.0)
     assert kept_blocks(PREPARED, (evidence(with_diverged(quiet, 3, 9.0, 0.15)),), BLOCKS)[1] == [[]]
     assert kept_blocks(PREPARED, (evidence(with_diverged(quiet, 3, 9.0, 0.25)),), BLOCKS)[1] == [[3]]
 
 
-def test_a_residual_within_the_recorded_range_is_no_divergence():
+def test_a_block_with_residuals_within_the_recorded_range_is_not_diverged():
     quiet = noise(0.1, 3.0)
     assert kept_blocks(PREPARED, (evidence(with_diverged(quiet, 3, 1.9)),), BLOCKS)[1] == [[]]
     assert kept_blocks(PREPARED, (evidence(with_diverged(quiet, 3, 2.1)),), BLOCKS)[1] == [[3]]
@@ -91,7 +91,7 @@ def test_a_constant_output_cannot_diverge():
     assert kept_blocks(still, (evidence(noise(0.1, 3.0)),), BLOCKS)[1] == [[]]
 
 
-def test_without_any_kept_block_there_are_no_sizes():
+def test_sizes_are_absent_if_all_blocks_diverge():
     gone = torch.full((N, 2), 1e9).double()
     found, diverged = sizes_of(PREPARED, UNITS, evidence(gone), evidence(noise(0.1, 3.0)), BLOCKS)
     assert found == {}

@@ -1,4 +1,4 @@
-"""Whether a step lasts or comes and goes."""
+"""Lasting steps are distinguished from intermittent steps."""
 
 import pytest
 import torch
@@ -27,7 +27,7 @@ def gain_of(course, size, phi=0.0, seed=0):
 
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize(("size", "phi"), [(3.0, 0.0), (0.15, 0.0), (3.0, 0.9), (0.7, 0.9)])
-def test_a_step_that_lasts_does_not_come_and_go(size, phi, seed):
+def test_a_lasting_step_is_not_intermittent(size, phi, seed):
     gain = gain_of((TIME >= ONSET).double(), size, phi, seed)
     assert not comes_and_goes(
         gain, TIME, float(ONSET), EvidenceSettings(), memory_of([torch.tensor([phi], dtype=torch.float64)])
@@ -36,7 +36,7 @@ def test_a_step_that_lasts_does_not_come_and_go(size, phi, seed):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("size", "phi"), [(3.0, 0.0), (1.0, 0.0), (3.0, 0.9)])
-def test_a_switched_offset_comes_and_goes(size, phi, seed):
+def test_a_switched_offset_is_intermittent(size, phi, seed):
     switched = (TIME >= ONSET).double() * (torch.sin((TIME - ONSET) / 100.0) >= -0.3).double()
     gain = gain_of(switched, size, phi, seed)
     assert comes_and_goes(

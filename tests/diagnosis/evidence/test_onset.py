@@ -1,4 +1,4 @@
-"""How surely an onset is known."""
+"""The confidence interval of an onset."""
 
 import dataclasses
 import json
@@ -20,8 +20,8 @@ from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import RATE, tumbling
 
-N, PLACE = 800, 450
-TRUE = (PLACE - 0.5) / RATE
+N, ONSET_INDEX = 800, 450
+TRUE_ONSET = (ONSET_INDEX - 0.5) / RATE
 STEP = next(effect for effect in CATALOGUE if effect.id == "hard_iron_step")
 CUBIC = next(effect for effect in CATALOGUE if effect.id == "cubic_nonlinearity")
 
@@ -29,12 +29,12 @@ CUBIC = next(effect for effect in CATALOGUE if effect.id == "cubic_nonlinearity"
 def interval(size, seed, *, corrupted=(0, 0), effect=STEP, shape=None):
     """Return the onset interval of a step fitted at its true onset, in noise of 0.5 µT."""
     random = np.random.default_rng(seed)
-    sensor = size * np.array([0.8, -0.6, 0.4]) * (np.arange(N) >= PLACE)[:, None]
+    sensor = size * np.array([0.8, -0.6, 0.4]) * (np.arange(N) >= ONSET_INDEX)[:, None]
     sensor[slice(*corrupted)] += 4000.0 * random.choice([-1.0, 1.0], (corrupted[1] - corrupted[0], 3))
     recording = tumbling(N, noise=0.5, sensor=sensor, seed=seed, attitude=True)
     prepared = Magnetometer("attitude").prepare(recording)
     base = fitted(JointModel(prepared), prepared.start())
-    model = base.model.with_term(Term(effect, None, {"onset": TRUE} if shape is None else shape))
+    model = base.model.with_term(Term(effect, None, {"onset": TRUE_ONSET} if shape is None else shape))
     start = base.parameters.new_zeros(model.size)
     start[: len(base.parameters)] = base.parameters
     best = fitted_with_effect(base, model, start)
@@ -49,26 +49,26 @@ def interval(size, seed, *, corrupted=(0, 0), effect=STEP, shape=None):
 @pytest.mark.e2e
 def test_the_interval_covers_the_onset_at_about_its_nominal_level():
     found = [interval(0.5, seed) for seed in range(25)]
-    assert sum(low <= TRUE <= high for low, high in found) >= 22
+    assert sum(low <= TRUE_ONSET <= high for low, high in found) >= 22
     width = np.median([high - low for low, high in found])
     assert 5.0 / RATE < width < 0.25 * N / RATE
 
 
 @pytest.mark.e2e
-def test_a_larger_step_is_known_better():
+def test_the_interval_is_shorter_for_a_larger_step():
     widths = [np.median([np.subtract(*interval(size, seed)[::-1]) for seed in range(3)]) for size in (0.4, 1.2, 6.0)]
     assert widths[0] > 2.0 * widths[1] > 2.0 * widths[2]
     assert widths[2] <= 4.0 / RATE
 
 
-def test_an_onset_in_a_burst_of_outliers_may_be_anywhere_in_it():
-    low, high = interval(3.0, 0, corrupted=(PLACE - 25, PLACE + 25))
-    assert low <= (PLACE - 24) / RATE
-    assert high >= (PLACE + 24) / RATE
+def test_the_interval_of_an_onset_in_a_burst_of_outliers_spans_the_burst():
+    low, high = interval(3.0, 0, corrupted=(ONSET_INDEX - 25, ONSET_INDEX + 25))
+    assert low <= (ONSET_INDEX - 24) / RATE
+    assert high >= (ONSET_INDEX + 24) / RATE
     assert high - low < 1.5
 
 
-def test_what_does_not_begin_has_none():
+def test_an_effect_without_an_onset_has_no_interval():
     assert interval(1.0, 0, effect=CUBIC, shape={}) is None
 
 

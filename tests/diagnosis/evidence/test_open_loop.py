@@ -17,7 +17,7 @@ from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import ConfirmationSettings
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 from tests.diagnosis.line import Line
-from tests.diagnosis.swing import at_the_truth, candidates
+from tests.diagnosis.swing import candidates, pendulum_at_truth
 
 BLOCKS = blocks_of(500, 1, ConfirmationSettings())
 KEPT = SimpleNamespace()
@@ -32,7 +32,7 @@ def located(fit):
 @functools.cache
 def under_process_noise():
     """Return fits without and with a drag, both under process noise."""
-    base = at_the_truth("white", 1)
+    base = pendulum_at_truth("white", 1)
     (term,) = [candidate for candidate in candidates(base, (QuadraticDrag(),)) if candidate.port == "rate of rate"]
     model = base.model.with_term(term)
     with_drag = dataclasses.replace(

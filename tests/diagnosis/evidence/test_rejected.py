@@ -19,7 +19,7 @@ def weights(*stretches):
     return torch.stack([torch.ones_like(TIME), 1.0 - torch.as_tensor(inside).clamp(max=1.0)], -1)
 
 
-def test_the_longest_stretches_are_named_in_order_of_time():
+def test_the_longest_stretches_are_reported_in_order_of_time():
     stretches = weights((5.0, 6.0), (20.0, 23.0), (30.0, 30.8), (40.0, 42.0), (50.0, 50.2))
     (sentence,) = rejected_warnings(rejected_intervals(TIME, stretches, Settings()))
     assert "from 5.0 to 6.0 s, from 20.0 to 23.0 s, from 40.0 to 42.0 s and in 1 shorter" in sentence

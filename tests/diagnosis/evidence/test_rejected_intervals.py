@@ -17,17 +17,17 @@ def disturbed(count, **changes):
     return dataclasses.replace(d, findings=tuple(dataclasses.replace(f, **changes) for f in d.findings))
 
 
-def test_the_headline_begins_with_a_disturbance():
+def test_the_headline_starts_with_the_rejected_interval():
     assert headline(disturbed(0)).startswith("Disturbed between 48.8 s and 51.8 s: most samples were rejected there.")
     assert "Disturbed" not in headline(make_diagnosis(0, evidence=()))
 
 
 @pytest.mark.parametrize(("grade", "found"), [("unconfirmed", BEFORE), ("left_out", FINAL), ("small", FINAL)])
-def test_an_unconfirmed_finding_does_not_cover_a_disturbance(grade, found):
+def test_rejected_intervals_of_unconfirmed_findings_are_those_before_the_findings(grade, found):
     assert disturbed(1, grade=grade).rejected_intervals == found
 
 
-def test_notes_and_intervals_are_in_the_file():
+def test_notes_and_rejected_intervals_are_in_diagnosis_json():
     pytest.importorskip("jsonschema")
     from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
 

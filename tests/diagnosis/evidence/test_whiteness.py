@@ -1,4 +1,4 @@
-"""Whether the residual is white, and up to which lag it is correlated."""
+"""Whiteness of the residual, and the lag up to which it is correlated."""
 
 import json
 
@@ -21,7 +21,7 @@ def draws(seed, count=N):
     return torch.as_tensor(np.random.default_rng(seed).standard_normal(count))
 
 
-def of(values, counts=None):
+def whiteness_of(values, counts=None):
     return whiteness(values, torch.ones_like(values) if counts is None else counts, EvidenceSettings())
 
 
@@ -32,28 +32,28 @@ def autoregressive(seed, phi):
     return values
 
 
-def test_about_one_white_series_in_a_hundred_is_called_correlated():
-    assert sum(of(draws(seed)).lag > 0 for seed in range(400)) <= 12
-    p_values = [of(draws(seed)).p_value for seed in range(400)]
+def test_one_per_cent_of_white_series_are_reported_as_correlated():
+    assert sum(whiteness_of(draws(seed)).lag > 0 for seed in range(400)) <= 12
+    p_values = [whiteness_of(draws(seed)).p_value for seed in range(400)]
     assert np.mean(np.less(p_values, 0.1)) == pytest.approx(0.1, abs=0.05)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_lag_is_that_of_a_moving_average(seed):
     mean = draws(seed).unfold(0, 8, 1).sum(-1)
-    assert 4 <= of(mean).lag <= 9
-    assert of(mean).neighbours == pytest.approx(7 / 8, abs=0.04)
+    assert 4 <= whiteness_of(mean).lag <= 9
+    assert whiteness_of(mean).neighbours == pytest.approx(7 / 8, abs=0.04)
 
 
-def test_a_longer_memory_reaches_farther():
-    lags = [np.median([of(autoregressive(seed, phi)).lag for seed in range(9)]) for phi in (0.5, 0.8, 0.95)]
+def test_the_correlation_length_grows_with_the_memory():
+    lags = [np.median([whiteness_of(autoregressive(seed, phi)).lag for seed in range(9)]) for phi in (0.5, 0.8, 0.95)]
     assert 1 < lags[0] < lags[1] < lags[2]
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_an_echo_is_found_at_its_lag(seed):
     noise = draws(seed)
-    assert of(noise[300:] + 0.5 * noise[:-300]).lag == 300
+    assert whiteness_of(noise[300:] + 0.5 * noise[:-300]).lag == 300
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -61,14 +61,14 @@ def test_rejected_samples_do_not_count_as_correlation(seed):
     """Nor do they hide correlation."""
     counts = (draws(100 + seed) < 0.8).double()
     counts[500:700] = 0.0
-    assert of(counts * draws(seed), counts).lag == 0
-    assert of(counts * autoregressive(seed, 0.8), counts).neighbours == pytest.approx(0.8, abs=0.06)
+    assert whiteness_of(counts * draws(seed), counts).lag == 0
+    assert whiteness_of(counts * autoregressive(seed, 0.8), counts).neighbours == pytest.approx(0.8, abs=0.06)
 
 
 def test_a_zero_residual_is_white():
-    assert of(torch.zeros(50, dtype=torch.float64)).lag == 0
-    assert of(torch.zeros(50, dtype=torch.float64), torch.zeros(50, dtype=torch.float64)).lag == 0
-    assert of(torch.ones(1, dtype=torch.float64)).lag == 0
+    assert whiteness_of(torch.zeros(50, dtype=torch.float64)).lag == 0
+    assert whiteness_of(torch.zeros(50, dtype=torch.float64), torch.zeros(50, dtype=torch.float64)).lag == 0
+    assert whiteness_of(torch.ones(1, dtype=torch.float64)).lag == 0
 
 
 def test_a_diagnosis_reports_whiteness_without_a_warning():

@@ -64,7 +64,7 @@ def test_keys_are_those_of_the_format(content):
     assert set(content["baseline"]) == {"log_likelihood", "rmse", "sigma", "d"}
 
 
-def test_the_ceiling_is_written_as_the_other_models_are():
+def test_the_ceiling_has_scores_and_density_in_the_file():
     diagnosis = make_diagnosis(1, channels=4)
     stored = written(diagnosis)["ceiling"]
     assert stored["rmse"] == diagnosis.ceiling.rmse
@@ -72,7 +72,7 @@ def test_the_ceiling_is_written_as_the_other_models_are():
     assert len(stored["sigma"]) == len(stored["d"]) == 4
 
 
-def test_what_is_for_the_report_alone_is_not_written():
+def test_results_for_the_report_only_are_not_written():
     diagnosis = with_finding(
         make_diagnosis(1),
         prediction.extrapolation_result(Extrapolation(0.2, (0.1, 0.3))),
@@ -80,7 +80,7 @@ def test_what_is_for_the_report_alone_is_not_written():
     assert written(diagnosis) == written(make_diagnosis(1))
 
 
-def test_the_region_and_the_experiments_are_written_where_there_are_any():
+def test_region_and_shares_of_runs_are_written_if_known():
     region = Region("level", "cm", "above", 14.2, 0.91, 0.1)
     (finding,) = written(with_finding(make_diagnosis(1), region=region, experiments=(0.25, 0.75)))["findings"]
     assert finding["region"] == dataclasses.asdict(region)
@@ -90,7 +90,7 @@ def test_the_region_and_the_experiments_are_written_where_there_are_any():
     assert "experiments" not in without
 
 
-def test_what_shifted_copies_of_a_driver_gain_is_written():
+def test_the_driver_shift_is_written():
     (finding,) = written(with_finding(make_diagnosis(1), timing.driver_shift_result(DriverShift(38, 2, 22.5))))[
         "findings"
     ]
@@ -98,7 +98,7 @@ def test_what_shifted_copies_of_a_driver_gain_is_written():
     assert "driver_shift" not in written(make_diagnosis(1))["findings"][0]
 
 
-def test_what_an_equation_needs_is_written():
+def test_components_references_and_event_times_of_a_finding_are_written():
     parameter = EffectParameter("gradient", (1.0, -2.0), (0.1, 0.2), "µT/m", ("∂B_x/∂y", "∂B_x/∂z"))
     changes = {
         "parameters": (parameter,), "event_times": (61.1, 77.8), "advice": "Do it.",
@@ -118,7 +118,7 @@ def test_what_an_equation_needs_is_written():
     )
 
 
-def test_the_noise_s_units_and_its_density_s_distances_are_written():
+def test_units_tails_and_density_check_of_the_noise_are_written():
     made = make_diagnosis(1)
     check = DensityCheck("norm", 0.02, 0.03, 4.0, 0.05, False)
     tails = (ChannelTails(31.5, 0.041, 0.006),)
@@ -168,13 +168,13 @@ def test_evidence_of_another_form_is_refused(content, evidence):
         validate(content)
 
 
-def test_components_are_as_many_as_the_numbers():
+def test_components_of_another_number_than_the_values_are_refused():
     parameter = EffectParameter("gradient", (1.0, -2.0, 3.0), None, "µT/m", ("a", "b"))
     with pytest.raises(DiagnosisFileError, match=r"parameters\.0\.components` differs in length"):
         diagnosis_to_json(with_finding(make_diagnosis(1), parameters=(parameter,)))
 
 
-def test_a_region_of_another_kind_is_refused(content):
+def test_a_region_of_unknown_kind_is_refused(content):
     content["findings"][0]["region"] = dataclasses.asdict(Region("level", "cm", "near", 14.2, 0.91, 0.1))
     with pytest.raises(DiagnosisFileError, match=r"findings\.0\.region\.kind"):
         validate(content)
@@ -192,14 +192,14 @@ def test_numbers_round_trip_exactly():
     assert content["findings"][0]["onset"] == 0.1 + 0.7
 
 
-def test_numpy_numbers_are_numbers():
+def test_numpy_numbers_are_written_as_json_numbers():
     parameter = EffectParameter("a", np.float64(0.3), np.float64("nan"), "")
     (stored,) = written(with_finding(make_diagnosis(1), parameters=(parameter,)))["findings"][0]["parameters"]
     assert stored["value"] == 0.3
     assert stored["standard_error"] is None
 
 
-def test_what_is_not_known_is_null_and_a_gaussian_bandwidth_is_inf(content):
+def test_unknown_values_are_null_and_a_gaussian_bandwidth_is_inf(content):
     assert content["corrected"]["sigma"] == ["inf"]
     assert content["findings"][1]["held_out"] is None
     assert content["findings"][1]["held_out_note"].startswith("The event")
@@ -244,12 +244,12 @@ def test_a_stopped_search_has_its_reason_and_the_skipped_steps():
         validate(stored)
 
 
-def test_missing_evidence_needs_its_reason():
+def test_missing_held_out_evidence_without_a_reason_is_refused():
     with pytest.raises(DiagnosisFileError, match="held_out_note"):
         diagnosis_to_json(with_finding(make_diagnosis(1), prediction.held_out_gain_result(None, "")))
 
 
-def test_a_verdict_agrees_with_its_findings():
+def test_a_verdict_that_contradicts_its_findings_is_refused():
     with pytest.raises(DiagnosisFileError, match="findings"):
         diagnosis_to_json(make_diagnosis(1, verdict="adequate"))
     with pytest.raises(DiagnosisFileError, match="findings"):
@@ -323,25 +323,25 @@ def test_missing_and_unknown_keys_are_refused(content, path):
         validate(content)
 
 
-def test_effects_of_the_users_own_are_allowed(content):
+def test_effects_defined_by_the_user_are_allowed(content):
     content["findings"][0]["effect"] = "my_magnet2"
     validate(content)
 
 
-def test_the_schema_is_a_schema():
+def test_the_schema_is_a_valid_json_schema():
     from jsonschema import Draft202012Validator
 
     assert json_schema()["$schema"] == Draft202012Validator.META_SCHEMA["$id"]
     Draft202012Validator.check_schema(json_schema())
 
 
-def test_text_stays_readable():
+def test_unicode_and_short_lists_stay_readable():
     text = diagnosis_to_json(make_diagnosis(1))
     assert "µT" in text
     assert "[3.2137, -1.1042, 0.3251]" in text
     assert text.endswith("}\n")
 
 
-def test_texts_from_files_are_kept_as_they_are():
+def test_texts_with_special_characters_round_trip():
     name = 'a "b" [1,\n 2] \\ <c> {d}'
     assert written(make_diagnosis(0, recording=name, warnings=(name, "")))["recording"] == name

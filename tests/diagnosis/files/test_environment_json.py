@@ -16,11 +16,11 @@ from tests.diagnosis.factory import (
     PROCESS_NOISE,
     graded,
     make_diagnosis,
+    make_disturbance,
     make_environment,
-    make_follows,
-    make_forcing,
+    make_goodness_of_fit,
     make_unfit,
-    nearest,
+    with_another_shape,
     with_evidence,
 )
 
@@ -58,8 +58,8 @@ def test_a_diagnosis_without_an_environment_is_written():
 
 
 def test_goodness_of_fit_is_written_in_the_unit_of_each_output():
-    unknown = make_follows("rate", "rad/s", rmse_of_last_value=math.nan, floor_source="quantisation")
-    content = written(disturbed(goodness_of_fit=(make_follows(), unknown)))
+    unknown = make_goodness_of_fit("rate", "rad/s", rmse_of_last_value=math.nan, floor_source="quantisation")
+    content = written(disturbed(goodness_of_fit=(make_goodness_of_fit(), unknown)))
     assert content["goodness_of_fit"]["angle"] == {
         "unit": "rad", "residual": 0.0049, "variation": 0.35, "explained": pytest.approx(0.9998, abs=1e-4),
         "noise_floor": 0.005, "floor_source": "declared", "rmse_of_mean": 0.35, "rmse_of_last_value": 0.021,
@@ -81,14 +81,14 @@ def test_process_noise_and_input_hold_are_written():
 
 @pytest.mark.parametrize(("samples", "points"), [(300, 300), (500, 500), (501, 251), (40_000, 500)])
 def test_a_long_disturbance_is_decimated(samples, points):
-    (forcing,) = written(disturbed(disturbance=(make_forcing(samples),)))["disturbance"]
+    (forcing,) = written(disturbed(disturbance=(make_disturbance(samples),)))["disturbance"]
     assert len(forcing["time"]) == len(forcing["value"]) == len(forcing["band"]) == points
     assert forcing["state"] == "rate"
     assert forcing["time"][:3] == [0.0, *forcing["time"][1:3]]
     assert max(len(f"{v:.12g}".lstrip("-0.").replace(".", "")) for v in forcing["value"]) <= 6
 
 
-def test_lists_of_a_disturbance_have_equal_lengths():
+def test_disturbance_lists_of_unequal_length_are_refused():
     content = written(disturbed())
     content["disturbance"][0]["band"].pop()
     with pytest.raises(DiagnosisFileError, match=r"disturbance\.0` has lists of different lengths"):
@@ -106,7 +106,8 @@ def test_whiteness_of_the_residual_is_written():
 def test_an_unfit_simulation_has_reasons_and_names_no_physics():
     content = written(make_unfit())
     assert content["verdict"] == "unfit"
-    assert content["reasons"][1] == "`damping` ends at its bound, 0."
+    assert content["reasons"] == list(make_unfit().environment.reasons)
+    assert "`damping`" in content["reasons"][1]
     with pytest.raises(DiagnosisFileError, match="findings"):
         diagnosis_to_json(make_diagnosis(1, verdict="unfit"))
 
@@ -126,7 +127,7 @@ def test_grades_shapes_and_sizes_of_each_output_are_written():
         (DivergedBlock(7, before=True, after=False),), 25,
     )  # fmt: skip
     made = make_diagnosis(1, samples=200)
-    finding = nearest(with_evidence(made.findings[0], prediction.held_out_gain_result(held, "")))
+    finding = with_another_shape(with_evidence(made.findings[0], prediction.held_out_gain_result(held, "")))
     (stored,) = written(dataclasses.replace(made, findings=(finding,)))["findings"]
     assert stored["grade"] == "nearest"
     assert stored["shape"] == {"free_curve_gain": 163.0, "p_value": 0.002, "formula": "0.0071 |x|^1.52 sign(x)"}

@@ -28,7 +28,7 @@ def model(effect, source):
     return DiagnosedModel("Vessel", {}, theta, [Term(effect, None, {}, "rate of level")], [gamma], source)
 
 
-def test_what_a_person_reads():
+def test_the_exported_class_is_short_and_names_its_base_and_effects():
     text = model(ThermalLoss(), Vessel()).to_python("vessels")
     assert text.count("\n") < 30
     for line in (
@@ -41,7 +41,7 @@ def test_what_a_person_reads():
     compile(text, "corrected.py", "exec")
 
 
-def test_what_cannot_be_written_out():
+def test_models_without_source_and_effects_without_code_are_refused():
     with pytest.raises(SourceError, match="give its simulation with `simulation=`"):
         model(ThermalLoss(), None).to_python()
 
@@ -92,7 +92,7 @@ def carts():
 
 
 @pytest.mark.parametrize("names", [(name,) for name in PLACES] + [tuple(PLACES)], ids="+".join)
-def test_the_corrected_class_simulates_what_the_model_does(names):
+def test_the_exported_class_has_the_residual_of_the_model(names):
     effects = {effect.id: effect for effect in DYNAMICS}
     recording = carts()
     prepared = Cart().prepare(recording)
@@ -129,7 +129,7 @@ class Heater(Dynamics):
 
 
 @pytest.mark.parametrize("place", range(6))
-def test_forms_with_and_without_surroundings_come_back_from_files_and_are_written_out(place):
+def test_forms_with_and_without_surroundings_are_restored_from_files_and_exported(place):
     time = torch.arange(80, dtype=torch.float64) * 0.1
     columns = {"time": time, "power": 3.0 + torch.sin(time), "outside": 5.0 + time.cos(), "temp": 20.0 + time}
     prepared = Heater().prepare(Recording(columns))

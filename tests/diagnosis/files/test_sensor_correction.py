@@ -1,4 +1,4 @@
-"""What is exported of a model is what it corrects: against `mkc apply`, by the formulas of the files."""
+"""Exported corrections, evaluated by the formulas of their files, equal `mkc apply`."""
 
 import json
 
@@ -17,7 +17,7 @@ from tests.calibration.exports import formulas
 OFFSET = (12.0, -8.0, 21.0)
 NORM = (*OFFSET, 0.95, 1.06, 0.99, -0.03, 0.02, -0.016)
 TURNED = (*OFFSET, 0.95, -0.05, 0.02, -0.01, 1.06, -0.016, 0.02, 0.03, 0.99)
-CLOSE = 0.01e-6  # T
+TOLERANCE = 0.01e-6  # T
 
 
 def driver(column, reference, unit):
@@ -33,7 +33,7 @@ def model_of(terms, gammas, theta=NORM, view="norm", unit="µT", simulation="mag
 
 CABLE = Term(CurrentField(), driver("current", 3.0, "A"), {})
 STEP = Term(HardIronStep(), None, {"onset": 20.0})
-WARMTH = Term(TemperatureOffset(), driver("temperature", 25.0, "°C"), {})
+TEMPERATURE = Term(TemperatureOffset(), driver("temperature", 25.0, "°C"), {})
 
 
 def recording(**columns):
@@ -44,12 +44,12 @@ def recording(**columns):
     return Recording({"time": torch.arange(60.0)} | axes | {"current": current} | columns)
 
 
-def applied(model, of):
+def field_by_apply(model, of):
     columns, _ = model.correct(of)
     return np.stack([columns[f"field_{axis}"].numpy() for axis in "xyz"], 1) * 1e-6
 
 
-def by_files(correction, of, current):
+def fields_by_exported_files(correction, of, current):
     readings = of.magnetometer().numpy() * 1e-6
     texts = {kind: EXPORTS[kind].text(correction, Destination()).text for kind in ("px4", "ardupilot", "json")}
     yield formulas.px4(formulas.qgroundcontrol(texts["px4"]), readings, current)
@@ -58,20 +58,20 @@ def by_files(correction, of, current):
 
 
 @pytest.mark.parametrize("terms", [(), (CABLE,), (STEP,), (CABLE, STEP), (STEP, CABLE)])
-def test_offset_matrix_current_and_what_lasts_are_exported_whole(terms):
-    """A step is bound to its time: apply takes its offset at the end off all of another recording, and so do they."""
+def test_exported_files_correct_offset_matrix_current_and_step_as_apply_does(terms):
+    """A step depends on the time: apply and the files subtract its final offset from all samples."""
     gammas = [{"current_field": (0.3, -0.2, 0.4), "hard_iron_step": (5.0, -3.0, 2.0)}[t.effect.id] for t in terms]
     model = model_of(terms, gammas)
     of = recording()
     correction = sensor_correction(model, "mast")
-    for field in by_files(correction, of, of["current"].numpy()):
-        assert np.abs(field - applied(model, of)).max() < CLOSE
+    for field in fields_by_exported_files(correction, of, of["current"].numpy()):
+        assert np.abs(field - field_by_apply(model, of)).max() < TOLERANCE
     assert (correction.current is not None) == (CABLE in terms)
     text = " ".join(correction.left_out)
     assert ("hard_iron_step depends on the time" in text) == (STEP in terms)
 
 
-def test_a_current_in_other_units_is_one_in_amperes():
+def test_a_current_in_milliamperes_is_exported_in_amperes():
     """4 nT/mA are 4 µT/A, and 3000 mA are 3 A."""
     model = model_of([Term(CurrentField(), driver("battery", 3000.0, "mA"), {})], [(3e-4, -2e-4, 4e-4)])
     found = sensor_correction(model, "mast").current
@@ -79,25 +79,24 @@ def test_a_current_in_other_units_is_one_in_amperes():
     assert (found.mean, found.column) == (pytest.approx(3.0), "battery")
     of = recording()
     of = recording(battery=1000.0 * of["current"])
-    for field in by_files(sensor_correction(model, "mast"), of, of["current"].numpy()):
-        assert np.abs(field - applied(model, of)).max() < CLOSE
+    for field in fields_by_exported_files(sensor_correction(model, "mast"), of, of["current"].numpy()):
+        assert np.abs(field - field_by_apply(model, of)).max() < TOLERANCE
 
 
 def test_other_effects_are_left_out_and_reported():
-    """The offset is that at the mean of the driver, where it equals that of apply."""
-    model = model_of([CABLE, WARMTH], [(0.3, -0.2, 0.4), (0.5, 0.1, -0.2)])
+    """At the mean of the driver, the exported offset equals that of apply."""
+    model = model_of([CABLE, TEMPERATURE], [(0.3, -0.2, 0.4), (0.5, 0.1, -0.2)])
     correction = sensor_correction(model, "mast")
-    assert correction.left_out == (
-        "temperature_offset is left out: an export holds an offset, a matrix and the field of a current. The offset "
-        "is that at `temperature` = 25 °C.",
-    )
+    (left_out,) = correction.left_out
+    assert left_out.startswith("temperature_offset is left out")
+    assert "`temperature` = 25 °C" in left_out
     of = recording(temperature=torch.full((60,), 25.0, dtype=torch.float64))
-    for field in by_files(correction, of, of["current"].numpy()):
-        assert np.abs(field - applied(model, of)).max() < CLOSE
-    assert correction.left_out[0] in EXPORTS["px4"].text(correction, Destination()).text
+    for field in fields_by_exported_files(correction, of, of["current"].numpy()):
+        assert np.abs(field - field_by_apply(model, of)).max() < TOLERANCE
+    assert left_out in EXPORTS["px4"].text(correction, Destination()).text
 
 
-def test_a_second_current_and_one_without_a_unit_are_left_out():
+def test_a_second_current_and_a_current_without_a_unit_are_left_out():
     second = Term(CurrentField(), driver("current_2", 1.0, "A"), {})
     correction = sensor_correction(model_of([CABLE, second], [(0.3, -0.2, 0.4), (0.1, 0.0, 0.0)]), "mast")
     assert correction.current.column == "current"
@@ -108,19 +107,19 @@ def test_a_second_current_and_one_without_a_unit_are_left_out():
     assert "no known unit of a current" in correction.left_out[0]
 
 
-def test_what_belongs_to_a_place_is_left_out():
+def test_a_location_specific_effect_is_left_out():
     placed = Term(MagneticPole(), driver("position_x", 0.0, "m"), {}, "field_of_the_world")
     correction = sensor_correction(model_of([placed], [(1.0, 1.0, 1.0)]), "mast")
     assert "depends on the location" in correction.left_out[0]
     assert correction.offset == pytest.approx(OFFSET)
 
 
-def test_a_matrix_of_any_kind_is_whole_where_the_file_takes_it():
+def test_a_matrix_with_a_rotation_is_exported_to_json_and_warned_of_elsewhere():
     model = model_of([], [], (*TURNED, 30.0, 0.0, 40.0), "gyro")
     of = recording()
     correction = sensor_correction(model, "mast")
-    *_, field = by_files(correction, of, 0.0)
-    assert np.abs(field - applied(model, of)).max() < CLOSE
+    *_, field = fields_by_exported_files(correction, of, 0.0)
+    assert np.abs(field - field_by_apply(model, of)).max() < TOLERANCE
     assert "turns the field by" in EXPORTS["px4"].text(correction, Destination()).warnings[0]
 
 

@@ -33,8 +33,8 @@ class Sledge(Dynamics):
         return {"speed": -9.81 * p.friction + 0.0 * x.speed}
 
 
-def slid(seed):
-    """Return three runs from 8 to 4 m/s, where a line and a parabola of the speed are nearly parallel."""
+def sledge_recording(seed):
+    """Return three runs from 8 to 4 m/s, in which linear and quadratic drag are nearly collinear."""
     random, tables = np.random.default_rng(seed), []
     time = np.arange(0.0, 4.0, 0.05)
     for run, start in enumerate((8.0, 8.1, 8.2)):
@@ -48,11 +48,11 @@ def slid(seed):
 
 @pytest.fixture(scope="module")
 def diagnosis():
-    return diagnose(Sledge(), slid(1), effects=FORMS, surrogates=19, max_findings=1)
+    return diagnose(Sledge(), sledge_recording(1), effects=FORMS, surrogates=19, max_findings=1)
 
 
 @pytest.mark.e2e
-def test_both_drags_have_their_own_sizes(diagnosis):
+def test_alternatives_have_the_parameters_of_their_own_fit(diagnosis):
     (finding,) = diagnosis.findings
     (other,) = finding.alternatives
     assert {finding.effect, other.effect} == {"linear_drag", "quadratic_drag"}
@@ -67,7 +67,7 @@ def test_both_drags_have_their_own_sizes(diagnosis):
 
 
 @pytest.mark.e2e
-def test_the_sizes_are_in_the_file_and_in_the_text(diagnosis):
+def test_parameters_of_alternatives_are_in_the_file_and_in_the_text(diagnosis):
     (finding,) = diagnosis.findings
     (other,) = finding.alternatives
     (written,) = json.loads(diagnosis_to_json(diagnosis))["findings"][0]["alternatives"]

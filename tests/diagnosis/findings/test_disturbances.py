@@ -13,7 +13,7 @@ from mkc_torch.simulation.dynamics.first_fit import strong_observer
 from mkc_torch.simulation.dynamics.noise import StateSpaceNoise
 from mkc_torch.simulation.dynamics.noise_selection import SelectedNoise
 from mkc_torch.simulation.dynamics.observer import Disturbance
-from tests.diagnosis.swing import NOISE, Pendulum, fitted_swing, swung
+from tests.diagnosis.swing import NOISE, Pendulum, fitted_pendulum, pendulum_recording
 
 TRUTH = {"white": Disturbance("rate", True, 0.0, 0.4), "slow": Disturbance("rate", True, 1.0, 0.3)}
 TRUTH["torque"] = Disturbance("rate", True, 0.6, 0.6)  # of the torque's duration, delayed
@@ -30,7 +30,7 @@ def noise_of(*disturbances, errors=None, gains=None):
 @functools.cache
 def at_the_truth(disturbance, seed):
     """Return a pendulum at its true parameters, observed along the recording."""
-    prepared = Pendulum().prepare(swung(disturbance, seed)[0])
+    prepared = Pendulum().prepare(pendulum_recording(disturbance, seed)[0])
     theta = torch.tensor([9.0, 0.15, 0.3, 0.0], dtype=torch.float64)
     model = JointModel(prepared.observed(strong_observer(prepared, theta, 10.0)))
     unit_scale, residual = theta.new_ones(1), model.residual(theta).detach()
@@ -40,7 +40,7 @@ def at_the_truth(disturbance, seed):
 @functools.cache
 def forcing(disturbance, seed):
     (found,) = forcing_of(at_the_truth(disturbance, seed), noise_of(TRUTH[disturbance]))
-    return found, swung(disturbance, seed)[1]
+    return found, pendulum_recording(disturbance, seed)[1]
 
 
 def correlation(first, second):
@@ -48,7 +48,7 @@ def correlation(first, second):
 
 
 def test_process_noise_has_the_unit_of_its_rate_or_output():
-    prepared = Pendulum().prepare(swung("white", 1)[0])
+    prepared = Pendulum().prepare(pendulum_recording("white", 1)[0])
     noise = noise_of(TRUTH["slow"], DRIFT, errors=(0.2, 0.05), gains=(311.0, 12.0))
     rate, angle = process_noise_of(prepared, noise)
     assert (rate.place, rate.at_rate, rate.correlation_time, rate.size, rate.log_likelihood_gain) == (
@@ -65,7 +65,7 @@ def test_process_noise_has_the_unit_of_its_rate_or_output():
 
 
 def test_the_standard_error_is_the_size_if_the_likelihood_has_no_curvature():
-    prepared = Pendulum().prepare(swung("white", 1)[0])
+    prepared = Pendulum().prepare(pendulum_recording("white", 1)[0])
     (process_noise,) = process_noise_of(prepared, noise_of(TRUTH["slow"], errors=(math.inf,)))
     assert process_noise.standard_error == process_noise.size
 
@@ -95,19 +95,21 @@ def test_the_estimate_follows_a_slow_disturbance_better_than_a_white_one(disturb
 
 
 @pytest.mark.parametrize("disturbance", ["white", "slow", "torque"])
-def test_the_first_sentence_states_whether_it_is_white(disturbance):
+def test_the_first_sentence_states_whether_a_disturbance_is_white(disturbance):
     first = forcing(disturbance, 1)[0].sentences[0]
     if disturbance == "white":
-        assert first == "The disturbance of the rate of rate is white."
+        assert "rate of rate is white" in first
     else:
         lasting = f"{TRUTH[disturbance].lasting:.2g} s"
-        assert first == f"The disturbance of the rate of rate is not white: its correlation time is about {lasting}."
+        assert "rate of rate is not white" in first
+        assert f"correlation time is about {lasting}" in first
 
 
 @pytest.mark.parametrize("disturbance", ["white", "slow"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_an_independent_disturbance_is_reported_as_uncorrelated_with_the_input(disturbance, seed):
-    assert forcing(disturbance, seed)[0].sentences[1:] == ("It is uncorrelated with torque at all lags.",)
+    (text,) = forcing(disturbance, seed)[0].sentences[1:]
+    assert "uncorrelated with torque" in text
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -141,7 +143,7 @@ def test_curves_of_an_independent_disturbance_are_zero_within_the_band(disturban
 @pytest.mark.e2e
 @pytest.mark.parametrize("disturbance", ["white", "slow"])
 def test_the_process_noise_of_a_fit_is_that_of_the_true_disturbance(disturbance):
-    environment = fitted_swing(disturbance)
+    environment = fitted_pendulum(disturbance)
     first = process_noise_of(environment.fit.model.prepared, environment.noise)[0]
     true = TRUTH[disturbance]
     assert (first.place, first.at_rate, first.unit) == ("rate", True, "rad/s/s")
@@ -149,10 +151,10 @@ def test_the_process_noise_of_a_fit_is_that_of_the_true_disturbance(disturbance)
     assert true.size / 2.0 < first.size < 2.0 * true.size
     assert first.log_likelihood_gain > 100.0
     found = forcing_of(environment.fit, environment.noise)[0]
-    assert correlation(found.value, swung(disturbance)[1]) > (0.9 if disturbance == "slow" else 0.35)
+    assert correlation(found.value, pendulum_recording(disturbance)[1]) > (0.9 if disturbance == "slow" else 0.35)
 
 
 def test_an_undisturbed_pendulum_has_no_process_noise():
-    environment = fitted_swing()
+    environment = fitted_pendulum()
     assert not environment.has_disturbances
     assert process_noise_of(environment.fit.model.prepared, environment.noise) == ()

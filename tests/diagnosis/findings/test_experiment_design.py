@@ -26,7 +26,7 @@ def diagnosed(temperature, current=CURRENT):
     return result, finding.alternatives[0]
 
 
-def more(text):
+def required_multiple(text):
     return float(text.split(" times as many samples")[0].split()[-1])
 
 
@@ -36,7 +36,7 @@ def test_the_distinguishing_state_is_reported():
     result, rival = diagnosed(np.minimum(current, 1.1), current)
     assert not rival.separable
     assert "in which temperature is above 20.3" in rival.distinguishing_state
-    assert more(rival.distinguishing_state) > 1.0
+    assert required_multiple(rival.distinguishing_state) > 1.0
     assert any(rival.distinguishing_state in sentence for sentence in advice_of(result))
 
 
@@ -51,7 +51,9 @@ def test_more_samples_are_needed_the_more_collinear_the_effects_are():
     assert not far.separable
     assert not near.separable
     # the information that distinguishes them grows with the square of their difference
-    assert more(near.distinguishing_state) / more(far.distinguishing_state) == pytest.approx(6.25, rel=0.35)
+    assert required_multiple(near.distinguishing_state) / required_multiple(far.distinguishing_state) == pytest.approx(
+        6.25, rel=0.35
+    )
 
 
 def test_separable_effects_need_no_further_recording():

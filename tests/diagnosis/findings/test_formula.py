@@ -28,11 +28,11 @@ def curve(make, low=-2.0, high=2.0, *, band=0.01, noise=0.0, driver="speed", uni
         (lambda x: 2.0 * x, (-9.0, -1.0), "2 speed m/s² (RMS error 0 %)"),
     ],
 )
-def test_known_functions_are_found(make, range_, text):
+def test_formulas_of_known_functions_are_found(make, range_, text):
     assert formulas(curve(make, *range_)) == (f"δ(rate of speed) = {text}",)
 
 
-def test_no_more_terms_than_the_band_requires():
+def test_a_formula_has_no_more_terms_than_the_band_requires():
     slightly_bent = curve(lambda x: x + 0.02 * x**3, band=0.2)
     (text,) = formulas(slightly_bent)
     assert "speed³" not in text
@@ -46,7 +46,7 @@ def test_a_curve_without_a_formula_has_a_large_rms_error():
     assert off > 20
 
 
-def test_each_channel_has_its_own():
+def test_each_channel_has_its_own_formula():
     x = torch.linspace(0.0, 40.0, 50, dtype=torch.float64)
     value = torch.stack([0.1 * x, -0.2 * x + 1.0], -1)
     found = formulas(Curve("temp", "°C", x, value, torch.full_like(value, 0.01), ("mag_x", "mag_y"), "µT"))

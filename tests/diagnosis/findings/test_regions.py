@@ -1,4 +1,4 @@
-"""Where a finding's gain arises: moment by moment it sums to the gain, and lies where the physics acts."""
+"""Attribution of a finding's gain to samples, states and runs."""
 
 import math
 
@@ -18,7 +18,7 @@ from tests.diagnosis.line import Line
 from tests.diagnosis.search.test_tangents import Offset
 from tests.diagnosis.test_dynamics_diagnosis import Pendulum
 
-OF = {effect.id: effect for effect in DYNAMICS}
+EFFECTS = {effect.id: effect for effect in DYNAMICS}
 
 
 def swings(hidden, first):
@@ -38,46 +38,46 @@ def swings(hidden, first):
 
 
 @pytest.fixture(scope="module")
-def stiffer():
-    """A spring that stiffens, in one run of large swings and one of small ones."""
+def stiffening_spring():
+    """Return the fit of a stiffening spring to a run of large swings and a run of small swings."""
     prepared = Pendulum().prepare(swings([lambda x, _: -4.0 * x**3] * 2, [1.2, 0.2]))
-    model = JointModel(prepared, (Term(OF["cubic_stiffness"], None, {}, "rate of speed"),))
+    model = JointModel(prepared, (Term(EFFECTS["cubic_stiffness"], None, {}, "rate of speed"),))
     return fitted(model, torch.cat([prepared.start(), prepared.time.new_tensor([3.0])]), graduate=False)
 
 
-def likelihood(fit, parameters):
+def log_likelihood(fit, parameters):
     return float(scored(fit.model.residual(parameters), fit.sigma, fit.d, fit.bound).sum())
 
 
-def test_the_moments_sum_to_the_gain(stiffer):
-    without = stiffer.parameters.clone()
+def test_sample_gains_sum_to_the_log_likelihood_gain(stiffening_spring):
+    without = stiffening_spring.parameters.clone()
     without[-1] = 0.0
-    gain = likelihood(stiffer, stiffer.parameters) - likelihood(stiffer, without)
+    gain = log_likelihood(stiffening_spring, stiffening_spring.parameters) - log_likelihood(stiffening_spring, without)
     assert gain > 100.0
-    assert float(attributed(stiffer, 0).nats.sum()) == pytest.approx(gain, rel=0.02)
+    assert float(attributed(stiffening_spring, 0).nats.sum()) == pytest.approx(gain, rel=0.02)
 
 
-def test_a_stiffening_spring_is_seen_far_from_zero(stiffer):
-    region = region_of(attributed(stiffer, 0))
+def test_the_region_of_a_stiffening_spring_is_far_from_zero(stiffening_spring):
+    region = region_of(attributed(stiffening_spring, 0))
     assert (region.state, region.unit, region.kind) == ("angle", "rad", "far from zero")
     assert region.bound > 0.3
     assert region.share_of_gain > 0.7
     assert region.share_of_time <= 0.5
 
 
-def test_it_is_seen_in_the_run_of_large_swings(stiffer):
-    large, small = shares_of_runs(attributed(stiffer, 0))
+def test_the_run_of_large_swings_has_the_gain_of_a_stiffening_spring(stiffening_spring):
+    large, small = shares_of_runs(attributed(stiffening_spring, 0))
     assert large > 0.95
     assert large + small == pytest.approx(1.0)
 
 
-def test_the_map_holds_the_whole_gain(stiffer):
-    found = attributed(stiffer, 0)
+def test_the_map_sums_to_the_gain_and_is_nan_where_no_state_was(stiffening_spring):
+    found = attributed(stiffening_spring, 0)
     drawn = map_of(found)
     assert drawn.states == ("angle", "speed")
     assert drawn.units == ("rad", "rad/s")
     assert float(drawn.nats.nansum()) == pytest.approx(float(found.nats.sum()))
-    # no pendulum was at its highest and at its fastest at once
+    # the pendulum is never at its largest angle and speed at once
     assert bool(drawn.nats.isnan().any())
 
 
@@ -94,7 +94,7 @@ def attribution(nats, **places):
         ("far from zero", lambda x: x.abs() > 0.9),
     ],
 )
-def test_each_kind_of_region(kind, inside):
+def test_each_kind_of_region_is_recognised(kind, inside):
     x = torch.linspace(-1.0, 1.0, 2001, dtype=torch.float64)
     region = region_of(attribution(inside(x), x=x, still=torch.zeros_like(x)))
     assert (region.state, region.kind) == ("x", kind)
@@ -102,17 +102,17 @@ def test_each_kind_of_region(kind, inside):
     assert region.share_of_time == pytest.approx(0.1, abs=0.002)
 
 
-def test_what_acts_everywhere_has_no_region():
+def test_an_effect_that_acts_everywhere_has_no_region():
     x = torch.linspace(-1.0, 1.0, 2001, dtype=torch.float64)
     assert region_of(attribution(torch.ones_like(x), x=x)) is None
 
 
-def test_what_gains_nothing_has_no_region():
+def test_an_effect_without_gain_has_no_region():
     x = torch.linspace(-1.0, 1.0, 2001, dtype=torch.float64)
     assert region_of(attribution(-torch.ones_like(x), x=x)) is None
 
 
-def test_what_is_gained_here_and_lost_there_has_neither_region_nor_shares():
+def test_gains_and_losses_that_cancel_have_neither_region_nor_shares():
     x = torch.linspace(-1.0, 1.0, 2001, dtype=torch.float64)
     run = (x > 0).long()
     found = Attribution(torch.where(x > 0, -0.9, 1.0).double(), {"x": x}, {}, {}, run)
@@ -120,13 +120,13 @@ def test_what_is_gained_here_and_lost_there_has_neither_region_nor_shares():
     assert shares_of_runs(found) == ()
 
 
-def test_one_state_has_no_map():
+def test_a_single_state_has_no_map():
     x = torch.linspace(-1.0, 1.0, 2001, dtype=torch.float64)
     assert map_of(attribution(torch.ones_like(x), x=x, still=torch.zeros_like(x))) is None
 
 
-def test_one_run_has_no_shares(stiffer):
-    found = attributed(stiffer, 0)
+def test_a_single_run_has_no_shares(stiffening_spring):
+    found = attributed(stiffening_spring, 0)
     alone = Attribution(found.nats, found.places, found.units, found.parts, torch.zeros_like(found.run))
     assert shares_of_runs(alone) == ()
 

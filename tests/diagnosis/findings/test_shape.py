@@ -1,4 +1,4 @@
-"""Whether a name's shape is the recording's: a free curve in its place is clearly better, or it is not."""
+"""The form of an effect compared with a free curve in its place."""
 
 import dataclasses
 import functools
@@ -40,8 +40,8 @@ class Boat(Dynamics):
 
 
 @functools.cache
-def sailed(power, seed):
-    """Against a drag of this power."""
+def boat_recording(power, seed):
+    """Return a recording of a boat against a drag of this power."""
     random = np.random.default_rng(seed)
     thrust = np.repeat(random.uniform(-1.5, 1.5, N // 10), 10)
     time = STEP * np.arange(N)
@@ -54,8 +54,8 @@ def sailed(power, seed):
     return Recording({name: torch.from_numpy(column) for name, column in columns.items()}, name="boat")
 
 
-def named(recording, effect):
-    """The fit with a name in it, and all candidates."""
+def fit_with(recording, effect):
+    """Return the fit with an effect, and all candidates."""
     prepared = Boat().prepare(recording)
     curves = [UnknownRate("own")]
     terms = candidate_terms(prepared, (), [effect, *curves])
@@ -66,20 +66,20 @@ def named(recording, effect):
 
 
 def shape(recording, effect, **settings):
-    fit, terms = named(recording, effect)
+    fit, terms = fit_with(recording, effect)
     return shape_of(fit, 0, terms, EvidenceSettings(**settings))
 
 
 @pytest.mark.e2e
-def test_a_name_of_the_right_shape_is_not_doubted_in_ten_draws():
-    found = [shape(sailed(2.0, seed), QuadraticDrag()) for seed in SEEDS]
+def test_the_true_form_has_no_better_curve_in_ten_draws():
+    found = [shape(boat_recording(2.0, seed), QuadraticDrag()) for seed in SEEDS]
     assert [one.curve for one in found] == [None] * len(found)
     assert [element.formula for element in found] == [""] * len(found)
     assert min(item.p_value for item in found) > 0.01
 
 
-def test_a_name_of_another_shape_is_the_nearest_with_a_formula_that_is_neither_a_line_nor_a_cube():
-    found = shape(sailed(2.0, 0), LinearDrag())
+def test_a_wrong_form_has_a_better_curve_with_a_power_law_as_formula():
+    found = shape(boat_recording(2.0, 0), LinearDrag())
     assert found.p_value < 1e-6
     assert found.free_curve_gain > 30.0
     curve = found.curve
@@ -89,23 +89,23 @@ def test_a_name_of_another_shape_is_the_nearest_with_a_formula_that_is_neither_a
     true = -0.4 * curve.x * curve.x.abs()
     torch.testing.assert_close(value[inside], true[inside], rtol=0.0, atol=0.1)
     assert bool((curve.band > 0.0).all())
-    # polynomials read a square with a sign as something between it and a cube
+    # a polynomial fit of x |x| has an exponent between those of a square and a cube
     assert 1.5 < float(found.formula.split("|^")[1].split()[0]) < 3.0
     assert "sign(speed)" in found.formula
 
 
 @pytest.mark.e2e
-def test_how_much_better_a_curve_has_to_be_is_set():
-    found = shape(sailed(2.0, 0), LinearDrag(), shape_nats=1e4)
+def test_settings_limit_the_gain_and_the_level_of_a_better_curve():
+    found = shape(boat_recording(2.0, 0), LinearDrag(), shape_nats=1e4)
     assert found.free_curve_gain > 30.0
     assert found.curve is None
-    assert shape(sailed(2.0, 0), LinearDrag(), shape_level=0.0).curve is None
+    assert shape(boat_recording(2.0, 0), LinearDrag(), shape_level=0.0).curve is None
 
 
-def test_a_curve_claims_no_shape_and_without_curves_there_is_nothing_to_compare_with():
-    fit, terms = named(sailed(2.0, 0), QuadraticDrag())
+def test_a_curve_has_no_shape_test_and_no_effect_has_one_without_curves():
+    fit, terms = fit_with(boat_recording(2.0, 0), QuadraticDrag())
     assert shape_of(fit, 0, [term for term in terms if not term.effect.is_curve], EvidenceSettings()) is None
-    curve = named(sailed(2.0, 0), QuadraticDrag())[1][-1]
+    curve = fit_with(boat_recording(2.0, 0), QuadraticDrag())[1][-1]
     assert curve.effect.is_curve
     model = JointModel(fit.model.prepared, (curve,))
     whole = torch.cat([fit.parameters[: model.base], torch.zeros(model.sizes[0]).double()])
@@ -114,12 +114,12 @@ def test_a_curve_claims_no_shape_and_without_curves_there_is_nothing_to_compare_
 
 
 @pytest.mark.parametrize(("noise", "rival"), [(False, True), (True, False)])
-def test_a_constant_has_no_rival_in_a_curve_that_only_follows_with_process_noise(monkeypatch, noise, rival):
+def test_a_curve_without_an_open_loop_gain_is_no_rival_of_a_constant_under_process_noise(monkeypatch, noise, rival):
     monkeypatch.setattr("mkc_torch.diagnosis.findings.shape.has_process_noise", lambda _: noise)
     monkeypatch.setattr("mkc_torch.diagnosis.findings.shape.improves_open_loop", lambda *_: False)
-    found = shape(sailed(2.0, 0), ConstantForce())
+    found = shape(boat_recording(2.0, 0), ConstantForce())
     assert (found is not None and found.curve is not None) == rival
-    assert shape(sailed(2.0, 0), LinearDrag()).curve is not None
+    assert shape(boat_recording(2.0, 0), LinearDrag()).curve is not None
 
 
 def curve_of(values, low=-2.0, driver="speed", band=0.01):
@@ -135,7 +135,7 @@ def test_a_power_law_is_found_exactly_in_addition_to_a_straight_line(power, low)
     assert nearest_power(drawn) == f"-0.7 |speed|^{power:.2g} sign(speed) plus a straight line"
 
 
-def test_where_a_curve_is_hardly_known_it_hardly_counts():
+def test_points_of_a_curve_with_a_wide_band_have_little_weight():
     drawn = curve_of(lambda x: -0.7 * x * x.abs())
     far = drawn.x > 2.0
     value, band = drawn.value.clone(), drawn.band.clone()

@@ -14,7 +14,7 @@ RAMP = torch.linspace(0.0, 1.0, 100, dtype=torch.float64)
 WAVES = {k: torch.sin((3.0 + k) * RAMP + k) for k in range(8)}
 
 
-def found(columns, units=None, taken=frozenset({"time"})):
+def drivers_of(columns, units=None, taken=frozenset({"time"})):
     return find_drivers(Recording({"time": 10.0 * RAMP} | columns, units=units), taken, DriverSettings())
 
 
@@ -37,12 +37,12 @@ def found(columns, units=None, taken=frozenset({"time"})):
 )
 def test_roles_come_from_the_name_and_then_the_unit(name, unit, role):
     assert role_of(name, unit) == role
-    (driver,) = found({name: WAVES[0]}, units={name: unit}).drivers
+    (driver,) = drivers_of({name: WAVES[0]}, units={name: unit}).drivers
     assert (driver.columns, driver.role, driver.units) == ((name,), role, (unit,))
 
 
-def test_values_are_less_their_mean():
-    (driver,) = found({"load": 5.0 + WAVES[0]}).drivers
+def test_driver_values_are_centred_on_their_mean():
+    (driver,) = drivers_of({"load": 5.0 + WAVES[0]}).drivers
     assert driver.values.shape == (100, 1)
     assert float(driver.reference) == pytest.approx(float(5.0 + WAVES[0].mean()))
     torch.testing.assert_close(driver.values[:, 0] + driver.reference, 5.0 + WAVES[0])
@@ -51,33 +51,33 @@ def test_values_are_less_their_mean():
 
 def test_position_is_one_driver_of_three_columns():
     columns = {f"position_{axis}": WAVES[k] for k, axis in enumerate("xyz")}
-    (driver,) = found(columns).drivers
+    (driver,) = drivers_of(columns).drivers
     assert (driver.role, driver.columns, driver.units) == ("position", tuple(columns), ("m", "m", "m"))
     assert driver.values.shape == (100, 3)
 
 
-def test_columns_of_the_simulation_and_run_numbers_are_no_drivers():
-    result = found({"mag_x": WAVES[0], "experiment": (RAMP > 0.5).double()}, taken=frozenset({"time", "mag_x"}))
+def test_columns_of_the_simulation_and_run_numbers_are_not_drivers():
+    result = drivers_of({"mag_x": WAVES[0], "experiment": (RAMP > 0.5).double()}, taken=frozenset({"time", "mag_x"}))
     assert result.drivers == ()
     assert result.warnings == ()
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, -3e8])
-def test_a_constant_column_is_no_driver(value):
-    result = found({"state": torch.full((100,), value), "load": WAVES[0]})
+def test_a_constant_column_is_not_a_driver_and_is_warned_of(value):
+    result = drivers_of({"state": torch.full((100,), value), "load": WAVES[0]})
     assert [d.columns for d in result.drivers] == [("load",)]
-    assert result.warnings == ("Column `state` is constant and can drive nothing.",)
+    (warning,) = result.warnings
+    assert "`state` is constant" in warning
 
 
 def test_a_column_without_values_is_left_out():
     mostly = WAVES[1].clone()
     mostly[:60] = math.nan
-    result = found({"empty": torch.full((100,), math.nan), "mostly": mostly, "load": WAVES[0]})
+    result = drivers_of({"empty": torch.full((100,), math.nan), "mostly": mostly, "load": WAVES[0]})
     assert [d.columns for d in result.drivers] == [("load",)]
-    assert result.warnings == (
-        "Column `empty` has no finite values and is left out.",
-        "Column `mostly` has only 40% finite values and is left out.",
-    )
+    empty_warning, mostly_warning = result.warnings
+    assert "`empty` has no finite values" in empty_warning
+    assert "`mostly` has only 40% finite values" in mostly_warning
 
 
 def test_missing_values_are_filled_from_their_neighbours():
@@ -85,41 +85,42 @@ def test_missing_values_are_filled_from_their_neighbours():
     values[[0, 1, 40, 41, 42, 99]] = torch.tensor(
         [math.nan, math.inf, math.nan, -math.inf, math.nan, math.nan]
     ).double()
-    result = found({"load": values})
+    result = drivers_of({"load": values})
     (driver,) = result.drivers
     expected = 4.0 * RAMP + 1.0
     expected[:2], expected[99] = expected[2], expected[98].clone()
     torch.testing.assert_close(driver.values[:, 0] + driver.reference, expected)
-    assert result.warnings == ("Column `load` lacks 6 values, filled from their neighbours in time.",)
+    (warning,) = result.warnings
+    assert "`load` lacks 6 values" in warning
 
 
-def test_a_constant_with_gaps_is_still_constant():
+def test_a_constant_column_with_gaps_is_not_a_driver():
     values = torch.ones(100, dtype=torch.float64)
     values[3] = math.nan
-    result = found({"state": values})
+    result = drivers_of({"state": values})
     assert result.drivers == ()
     assert len(result.warnings) == 2
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (-2.0, 7.0), (1e-6, 300.0)])
-def test_copies_are_one_driver(gain, offset):
-    result = found({"load": WAVES[0], "rpm": WAVES[1], "power": gain * WAVES[0] + offset})
+def test_copies_of_a_column_are_a_single_driver(gain, offset):
+    result = drivers_of({"load": WAVES[0], "rpm": WAVES[1], "power": gain * WAVES[0] + offset})
     assert [(d.columns, d.copies) for d in result.drivers] == [(("load",), ("power",)), (("rpm",), ())]
     (warning,) = result.warnings
     assert "`load` and `power` are copies" in warning
 
 
 def test_a_copy_of_known_role_represents_the_others():
-    result = found({"x1": WAVES[0], "rpm": WAVES[1], "x2": -WAVES[0], "temperature": 20.0 + 3.0 * WAVES[0]})
+    result = drivers_of({"x1": WAVES[0], "rpm": WAVES[1], "x2": -WAVES[0], "temperature": 20.0 + 3.0 * WAVES[0]})
     assert [(d.columns, d.role, d.copies) for d in result.drivers] == [
         (("rpm",), "any", ()), (("temperature",), "temperature", ("x1", "x2")),
     ]  # fmt: skip
 
 
-def test_a_similar_column_is_no_copy():
+def test_a_nearly_equal_column_is_not_a_copy():
     near = WAVES[0] + 0.003 * WAVES[1]
     assert float(torch.corrcoef(torch.stack([near, WAVES[0]]))[0, 1]) > 0.9999
-    assert len(found({"load": WAVES[0], "near": near}).drivers) == 2
+    assert len(drivers_of({"load": WAVES[0], "near": near}).drivers) == 2
 
 
 def test_drivers_do_not_depend_on_the_order_of_columns():
@@ -127,11 +128,11 @@ def test_drivers_do_not_depend_on_the_order_of_columns():
                "position_y": WAVES[4], "current": WAVES[5], "position_z": WAVES[6]}  # fmt: skip
     columns["gap"] = WAVES[7].clone()
     columns["gap"][5] = math.nan
-    first = found(columns)
+    first = drivers_of(columns)
     orders = np.random.default_rng(0)
     for _ in range(5):
         names = orders.permutation(list(columns)).tolist()
-        again = found({name: columns[name] for name in names})
+        again = drivers_of({name: columns[name] for name in names})
         assert again.warnings == first.warnings
         by_name = {d.columns: d for d in again.drivers}
         assert set(by_name) == {d.columns for d in first.drivers}
@@ -145,13 +146,13 @@ def test_drivers_do_not_depend_on_the_order_of_columns():
 
 def test_hundreds_of_columns_are_separate_drivers():
     values = torch.randn(300, 100, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    result = found({f"c{k}": row for k, row in enumerate(values)})
+    result = drivers_of({f"c{k}": row for k, row in enumerate(values)})
     assert [d.columns[0] for d in result.drivers] == [f"c{k}" for k in range(300)]
     assert result.warnings == ()
 
 
-def test_no_columns_no_drivers():
-    assert found({}).drivers == ()
+def test_a_recording_of_time_only_has_no_drivers():
+    assert drivers_of({}).drivers == ()
 
 
 def test_effects_can_define_their_own_roles():
@@ -165,7 +166,7 @@ def test_effects_can_define_their_own_roles():
     ]  # fmt: skip
 
 
-def test_an_incomplete_position_is_no_position():
+def test_columns_of_an_incomplete_position_are_separate_drivers():
     recording = Recording({"time": RAMP, "position_x": WAVES[0], "position_y": WAVES[1], "position_z": 0.0 * RAMP})
     drivers = find_drivers(recording, frozenset({"time"}), DriverSettings(), frozenset({"position", "any"})).drivers
     assert [(d.columns, d.role) for d in drivers] == [(("position_x",), "any"), (("position_y",), "any")]
@@ -187,7 +188,7 @@ def test_a_few_values_far_from_all_others_count_as_missing(glitch, places):
     assert "far from all others" in sentence
 
 
-def test_pulses_and_rare_switches_are_no_glitches():
+def test_pulses_and_rare_switches_are_not_missing_values():
     """A motor that runs for 0.1 s, and a switch that is rarely on."""
     time = torch.linspace(0.0, 20.0, 1000, dtype=torch.float64)
     noise = torch.randn(1000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -202,7 +203,7 @@ def test_pulses_and_rare_switches_are_no_glitches():
     assert [float(driver.values.max()) > 0.9 for driver in result.drivers] == [True, True]
 
 
-def test_a_column_that_repeats_a_measured_column_is_no_driver():
+def test_a_copy_of_a_measured_column_is_not_a_driver():
     time = torch.linspace(0.0, 20.0, 1000, dtype=torch.float64)
     measured = 40.0 * torch.sin(time)
     columns = {"time": time, "mag_x": measured, "raw_x": (6.842 * measured).round() + 17.0, "load": torch.cos(time)}
@@ -210,9 +211,10 @@ def test_a_column_that_repeats_a_measured_column_is_no_driver():
         Recording(columns), frozenset({"time", "mag_x"}), DriverSettings(), measured=frozenset({"mag_x"})
     )
     assert [driver.columns for driver in result.drivers] == [("load",)]
-    assert result.warnings == ("Column `raw_x` repeats `mag_x` and is left out: it drives nothing.",)
+    (warning,) = result.warnings
+    assert "`raw_x` repeats `mag_x`" in warning
 
 
-def test_a_column_that_repeats_time_is_a_driver():
-    result = found({"temperature": 20.0 + 3.0 * RAMP})
+def test_a_column_linear_in_time_is_a_driver():
+    result = drivers_of({"temperature": 20.0 + 3.0 * RAMP})
     assert [driver.columns for driver in result.drivers] == [("temperature",)]

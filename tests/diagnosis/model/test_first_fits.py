@@ -79,7 +79,7 @@ def room():
 @pytest.mark.parametrize(
     ("simulation", "recording", "expected"), [(Motor(), motor(), [-2.5, 50.0]), (Room(), room(), [0.1, 2.0])]
 )
-def test_a_first_fit_that_diverges_is_restarted_elsewhere(simulation, recording, expected):
+def test_a_first_fit_that_diverges_restarts_from_other_parameters(simulation, recording, expected):
     prepared = simulation.prepare(recording)
     found = fit_alone(prepared, {}, Settings().noise)
     assert found.fit.parameters[:2].tolist() == pytest.approx(expected, rel=0.2)
@@ -103,7 +103,7 @@ def test_the_first_start_of_the_motor_has_no_fit():
         fitted(JointModel(prepared), prepared.start())
 
 
-def test_a_failure_of_all_starts_is_explained(monkeypatch):
+def test_the_error_after_all_starts_fail_states_the_reason(monkeypatch):
     def lost(*_, **__):
         raise NoFitError("Expected `residual` to be finite at `start` but got 5782 of 8150 values that are not.")
 

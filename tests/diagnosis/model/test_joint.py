@@ -63,7 +63,7 @@ def test_terms_have_columns_and_keys(driver):
     assert Term(Cubic(), None, {}).columns == ()
 
 
-def test_effects_see_their_port(line, driver):
+def test_an_effect_has_time_drivers_signal_and_units_of_its_port(line, driver):
     signal = line.signals(line.start(), {})["mixed"]
     context = Term(Mixed(), driver, {}).context(line, signal)
     assert torch.equal(context.time, line.time)
@@ -76,7 +76,7 @@ def test_effects_see_their_port(line, driver):
     assert (alone.units, alone.signal_unit) == ((), "l/s")
 
 
-def test_parameters_are_the_simulations_and_then_the_effects(model):
+def test_simulation_parameters_precede_effect_parameters(model):
     assert (model.base, model.sizes, model.size) == (2, (3, 3, 1), 9)
     assert [g.tolist() for g in model.gammas(PARAMETERS)] == [[0.1, -0.2, 0.3], [0.01, 0.02, -0.03], [0.5]]
     assert JointModel(model.prepared).gammas(PARAMETERS[:2]) == ()
@@ -93,7 +93,7 @@ def test_changes_at_one_port_add_up(model, line, driver):
     assert JointModel(line).changes(PARAMETERS[:2]) == {}
 
 
-def test_the_residual_has_the_changes_in_it(model, line):
+def test_the_residual_includes_the_changes_of_effects(model, line):
     expected = line.residual(PARAMETERS[:2], model.changes(PARAMETERS))
     assert torch.equal(model.residual(PARAMETERS), expected)
     still = torch.cat([PARAMETERS[:2], torch.zeros(7).double()])
@@ -107,7 +107,7 @@ def test_the_residual_has_the_changes_in_it(model, line):
         full_prior(),
     ],
 )
-def test_nothing_is_known_of_effects_beforehand(driver, prior):
+def test_effect_parameters_have_a_flat_prior(driver, prior):
     line = Line(prior=prior)
     assert JointModel(line).prior is prior
     known = JointModel(line, (Term(Mixed(), driver, {}),)).prior
@@ -120,7 +120,7 @@ def test_nothing_is_known_of_effects_beforehand(driver, prior):
     assert not bool(precision[2:].any() or precision[:, 2:].any())
 
 
-def test_terms_are_added_and_reshaped(line, driver):
+def test_with_term_and_with_shape_return_new_models(line, driver):
     model = JointModel(line).with_term(Term(Mixed(), driver, {})).with_term(Term(Mixed(), driver, {"more": 1.0}))
     assert [t.shape for t in model.terms] == [{}, {"more": 1.0}]
     assert [t.shape for t in model.with_shape({"more": 2.0}).terms] == [{}, {"more": 2.0}]
@@ -128,14 +128,14 @@ def test_terms_are_added_and_reshaped(line, driver):
     assert model.size == 8
 
 
-def test_directions_are_how_the_change_grows(line, driver):
+def test_directions_are_derivatives_of_the_change(line, driver):
     context = Term(Mixed(), driver, {}).context(line, None)
     found = directions(Term(Mixed(), driver, {}), context)
     assert found.shape == (100, 3, 3)
     torch.testing.assert_close(found, driver.values.unsqueeze(-1) * torch.eye(3).double())
 
 
-def by_differences(model, parameters, port, courses, step=1e-5):
+def tangents_by_differences(model, parameters, port, courses, step=1e-5):
     """Residual tangents of changes at a port, by central differences around what the effects add there."""
     columns = []
     for k in range(courses.shape[-1]):
@@ -144,29 +144,29 @@ def by_differences(model, parameters, port, courses, step=1e-5):
     return torch.stack(columns, -1)
 
 
-def test_the_pointwise_jacobian_is_that_of_each_sample(model, line):
+def test_the_pointwise_jacobian_of_a_line_is_minus_its_mixing(model, line):
     torch.testing.assert_close(port_jacobian(model, PARAMETERS, "mixed"), -line.mixing)
 
 
 @pytest.mark.parametrize("terms", [0, 3])
-def test_tangents_through_ports_are_finite_differences(model, line, terms):
+def test_tangents_through_ports_agree_with_finite_differences(model, line, terms):
     some = JointModel(line, model.terms[:terms])
     parameters = PARAMETERS[: some.size]
     generator = torch.Generator().manual_seed(2)
     mixed = torch.randn(100, 3, 4, generator=generator, dtype=torch.float64)
     pointwise = port_jacobian(some, parameters, "mixed")
-    expected = by_differences(some, parameters, "mixed", mixed)
+    expected = tangents_by_differences(some, parameters, "mixed", mixed)
     torch.testing.assert_close(
         through_port(some, parameters, "mixed", mixed, pointwise), expected, rtol=1e-6, atol=1e-8
     )
     torch.testing.assert_close(through_port(some, parameters, "mixed", mixed, None), expected, rtol=1e-6, atol=1e-8)
     summed = torch.randn(100, 1, 3, generator=generator, dtype=torch.float64)
-    expected = by_differences(some, parameters, "summed", summed)
+    expected = tangents_by_differences(some, parameters, "summed", summed)
     torch.testing.assert_close(through_port(some, parameters, "summed", summed, None), expected, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("use", ["norm", "attitude", "gyro"])
-def test_tangents_through_the_ports_of_a_magnetometer_are_finite_differences(use):
+def test_tangents_through_the_ports_of_a_magnetometer_agree_with_finite_differences(use):
     prepared = Magnetometer(use=use).prepare(tumbling(500, noise=0.3, gyro=True, attitude=True))
     model = JointModel(prepared, (Term(EFFECTS["cubic_nonlinearity"], None, {}),))
     parameters = torch.cat([prepared.start(), torch.tensor([1e-6, -2e-6, 1e-6]).double()])
@@ -176,7 +176,7 @@ def test_tangents_through_the_ports_of_a_magnetometer_are_finite_differences(use
         courses = weight.unsqueeze(-1) * slow.unsqueeze(1)
         pointwise = port_jacobian(model, parameters, port) if known.pointwise else None
         found = through_port(model, parameters, port, courses, pointwise)
-        expected = by_differences(model, parameters, port, courses)
+        expected = tangents_by_differences(model, parameters, port, courses)
         # a gyroscope's windows hold the weights of their mean fixed, which differences do not
         assert float((found - expected).abs().max()) < (0.1 if use == "gyro" else 1e-6) * float(expected.abs().max())
         torch.testing.assert_close(through_port(model, parameters, port, courses, None), found, rtol=1e-6, atol=1e-8)

@@ -1,4 +1,4 @@
-"""Fits from other processes are complete."""
+"""Serialization of fits between processes."""
 
 import torch
 
@@ -34,12 +34,12 @@ class Decay(Dynamics):
         return {"level": -p.rate * x.level}
 
 
-def sent(fits, known):
+def through_serializer(fits, known):
     parcels = Serializer(known)
     return parcels.unpacked(parcels.packed(fits))
 
 
-def test_a_fit_keeps_its_effect_and_driver():
+def test_a_deserialized_fit_has_the_same_effect_and_driver():
     line = Line()
     driver = Driver(("load",), "any", torch.sin(3.0 * line.time).unsqueeze(-1), torch.tensor([7.0]).double(), ("kg",))
     terms = [Term(Along("first"), driver, {"first": 1.0}), Term(Along("other"), driver, {"other": 2.0})]
@@ -47,7 +47,7 @@ def test_a_fit_keeps_its_effect_and_driver():
     for term in terms:
         model = JointModel(line, [term])
         fits.append(fitted(model, torch.cat([line.start(), torch.zeros(3)])))
-    for fit, back in zip(fits, sent(fits, common_parts(line, terms)), strict=True):
+    for fit, back in zip(fits, through_serializer(fits, common_parts(line, terms)), strict=True):
         assert back.model.prepared is line
         assert back.model.terms[0].effect is fit.model.terms[0].effect
         assert back.model.terms[0].driver is driver
@@ -56,11 +56,11 @@ def test_a_fit_keeps_its_effect_and_driver():
         assert torch.equal(back.model.residual(back.parameters), fit.residual)
 
 
-def test_a_fit_keeps_its_trajectory():
+def test_a_deserialized_fit_has_its_trajectory():
     time = torch.linspace(0.0, 3.0, 61, dtype=torch.float64)
     noise = 0.01 * torch.randn(61, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     prepared = Decay().prepare(Recording({"time": time, "level": torch.exp(-1.5 * time) + noise}))
     fit = fitted(JointModel(prepared), prepared.start())
-    (back,) = sent([fit], common_parts(prepared, ()))
+    (back,) = through_serializer([fit], common_parts(prepared, ()))
     assert torch.equal(back.model.near.states, fit.model.near.states)
     assert torch.equal(back.model.residual(back.parameters), fit.residual)

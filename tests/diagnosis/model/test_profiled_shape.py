@@ -32,8 +32,8 @@ class Cart(Dynamics):
 
 
 @functools.cache
-def base(noise=NOISE):
-    """The fit of a cart that responds 0.16 s late to steps of its force, without the delay."""
+def fit_without_delay(noise=NOISE):
+    """Return the fit of a cart that responds 0.16 s late to steps of its force, without the delay."""
     generator = torch.Generator().manual_seed(0)
     N = 600
     force = torch.randn(N // 10, generator=generator, dtype=torch.float64).repeat_interleave(10)
@@ -52,15 +52,15 @@ def base(noise=NOISE):
 
 
 def with_effect(name, noise=NOISE, **shape):
-    """The fit with an effect, at this shape."""
-    effect, alone = next(effect for effect in DYNAMICS if effect.id == name), base(noise)
+    """Return the fit with an effect, at this shape."""
+    effect, alone = next(effect for effect in DYNAMICS if effect.id == name), fit_without_delay(noise)
     term = candidate_terms(alone.model.prepared, (), (effect,))[0]
     model = alone.model.with_term(replace(term, shape={**term.shape, **shape}))
     return fitted(model, torch.cat([alone.parameters, alone.parameters.new_tensor([0.5])]), alone.bound)
 
 
 @pytest.mark.parametrize("start", [0.06, 0.0999])
-def test_a_delay_is_found_beyond_the_next_local_maximum(start):
+def test_the_profile_finds_a_delay_beyond_a_local_maximum(start):
     stuck = shape_fitted(with_effect("input_delay", delay=start))
     assert abs(stuck.model.terms[-1].shape["delay"] - DELAYED * STEP) > STEP
     found = with_profiled_shape(stuck)
@@ -69,26 +69,26 @@ def test_a_delay_is_found_beyond_the_next_local_maximum(start):
     assert float(found.residual.square().mean().sqrt()) == pytest.approx(NOISE, rel=0.15)
 
 
-def test_effects_without_a_delay_stay():
+def test_a_fit_without_a_delay_is_unchanged_by_the_profile():
     fit = with_effect("dead_zone")
     assert with_profiled_shape(fit) is fit
 
 
 def delay_and_error(noise):
-    """The fit with the delay, and the delay's standard error."""
+    """Return the fit with the delay, and the delay's standard error."""
     fit = with_profiled_shape(shape_fitted(with_effect("input_delay", noise, delay=0.15)))
     (errors,) = estimate(fit, NoiseSettings()).shape_errors
     return fit, errors["delay"]
 
 
-def test_the_error_of_a_well_known_delay_is_the_resolution_of_a_sample():
+def test_the_error_of_a_delay_in_weak_noise_is_the_sampling_resolution():
     fit, error = delay_and_error(NOISE)
     assert error == pytest.approx(STEP / math.sqrt(12.0), rel=0.1)
     assert abs(fit.model.terms[-1].shape["delay"] - DELAYED * STEP) < 2.0 * error
 
 
 def test_the_error_of_a_delay_in_strong_noise_grows_with_the_noise():
-    """Within one sample interval nothing is known, so that part of the variance stays."""
+    """The variance within a sample interval is constant; the remainder grows with the noise."""
     within = STEP**2 / 12.0
     (weak, strong) = (delay_and_error(noise)[1] for noise in (0.05, 0.1))
     assert weak > STEP

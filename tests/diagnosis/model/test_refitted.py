@@ -23,8 +23,8 @@ def base():
     return fitted(JointModel(prepared), prepared.start())
 
 
-def looked(base, *gamma):
-    """A stub of a search that estimates these sizes."""
+def search_result(base, *gamma):
+    """Return a stub of a search that estimates these sizes."""
     estimate = torch.tensor(gamma, dtype=torch.float64)
     return SimpleNamespace(scene=SimpleNamespace(base=base), estimate=lambda _: estimate)
 
@@ -32,6 +32,6 @@ def looked(base, *gamma):
 @pytest.mark.parametrize("wrong_size", [0.0, -0.3, 30.0, -1e4])
 def test_a_fit_that_diverges_restarts_from_size_zero(base, wrong_size):
     term = Term(EFFECT, None, {"terms": 2.0})
-    found = refitted(base, term, looked(base, *[wrong_size] * 6), 0)
+    found = refitted(base, term, search_result(base, *[wrong_size] * 6), 0)
     assert found.log_likelihood >= base.log_likelihood - 1e-6
     assert found.converged

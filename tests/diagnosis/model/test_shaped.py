@@ -1,4 +1,4 @@
-"""Shape numbers of known effects are fitted jointly, between the points of the grid."""
+"""Shape parameters of effects are fitted jointly, starting from the points of the grid."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics, Parameter
 
-OF = {effect.id: effect for effect in DYNAMICS}
+EFFECTS = {effect.id: effect for effect in DYNAMICS}
 N = 400
 
 
@@ -31,7 +31,7 @@ class Lag(Dynamics):
 
 
 def driven(act, seed=0, behind=0.0):
-    """The level of a lag whose drive is distorted by ``act``, seen by a sensor with a lag of ``behind`` s."""
+    """Return the level of a lag whose drive is distorted by ``act``, seen by a sensor with a lag of ``behind`` s."""
     generator = torch.Generator().manual_seed(seed)
     time = 0.05 * torch.arange(N, dtype=torch.float64)
     drive = 2.0 * torch.sin(0.9 * time) + torch.sin(2.3 * time + 1.0)
@@ -48,7 +48,7 @@ def driven(act, seed=0, behind=0.0):
     return Recording({"time": time, "drive": drive, "level": torch.tensor(shown[::20], dtype=torch.float64) + noise})
 
 
-def found(recording, *known):
+def joint_fit(recording, *known):
     """Return the joint fit with effects, each followed by its shape on the grid."""
     prepared = Lag().prepare(recording)
     terms = []
@@ -60,9 +60,9 @@ def found(recording, *known):
     return fitted(JointModel(prepared, terms), torch.cat([base.parameters, half]), base.bound)
 
 
-def test_a_limit_between_grid_points_is_found():
+def test_a_saturation_limit_between_grid_points_is_estimated():
     recording = driven(lambda u: 1.37 * torch.tanh(u / 1.37))
-    before = found(recording, OF["input_saturation"], {"limit": 1.8})
+    before = joint_fit(recording, EFFECTS["input_saturation"], {"limit": 1.8})
     after = shape_fitted(before)
     assert before.model.terms[-1].shape["limit"] == 1.8
     assert after.log_likelihood > before.log_likelihood + 100.0
@@ -74,40 +74,40 @@ def test_a_limit_between_grid_points_is_found():
     assert float(after.residual.square().mean().sqrt()) < 0.0115
 
 
-def test_a_hard_limit_stays_hard():
+def test_a_hard_limit_has_a_softness_near_zero():
     recording = driven(lambda u: u.clamp(-1.37, 1.37))
-    after = shape_fitted(found(recording, OF["input_saturation"], {"limit": 1.2}))
+    after = shape_fitted(joint_fit(recording, EFFECTS["input_saturation"], {"limit": 1.2}))
     shape = after.model.terms[-1].shape
     assert shape["limit"] == pytest.approx(1.37, abs=0.01)
     assert shape["softness"] < 0.05
     assert float(after.parameters[-1]) == pytest.approx(1.0, abs=0.01)
 
 
-def test_a_delay_is_found_with_its_share():
+def test_a_delay_and_its_share_are_estimated_jointly():
     late = driven(lambda u: torch.cat([u[:1].expand(123), u[:-123]]))  # 123 of 20 for each 0.05 s
-    after = shape_fitted(found(late, OF["input_delay"], {"delay": 0.2}))
+    after = shape_fitted(joint_fit(late, EFFECTS["input_delay"], {"delay": 0.2}))
     assert after.model.terms[-1].shape["delay"] == pytest.approx(0.3075, abs=0.01)
     assert float(after.parameters[-1]) == pytest.approx(1.0, abs=0.02)
 
 
-def test_the_shape_of_an_earlier_effect_moves_with_that_of_a_later_one():
+def test_the_shapes_of_two_effects_are_fitted_jointly():
     recording = driven(lambda u: u.clamp(-1.37, 1.37), behind=0.15)
-    before = found(recording, OF["input_saturation"], {"limit": 1.2}, OF["sensor_lag"], {"lag": 0.3})
+    before = joint_fit(recording, EFFECTS["input_saturation"], {"limit": 1.2}, EFFECTS["sensor_lag"], {"lag": 0.3})
     limit, lag = (term.shape for term in shape_fitted(before).model.terms)
     assert limit["limit"] == pytest.approx(1.37, abs=0.02)
     assert lag["lag"] == pytest.approx(0.15, abs=0.03)
     assert all(isinstance(value, float) for value in (*limit.values(), *lag.values()))
 
 
-def test_an_effect_without_shape_numbers_is_unchanged():
+def test_an_effect_without_shape_parameters_is_unchanged():
     prepared = Lag().prepare(driven(lambda u: u))
-    (term,) = candidate_terms(prepared, (), (OF["constant_force"],))
+    (term,) = candidate_terms(prepared, (), (EFFECTS["constant_force"],))
     model = JointModel(prepared, (term,))
     fit = fitted(model, torch.cat([prepared.start(), prepared.time.new_zeros(1)]))
     assert shape_fitted(fit) is fit
 
 
-class Broken(type(OF["input_saturation"])):
+class Broken(type(EFFECTS["input_saturation"])):
     """An effect that is finite only for shapes of the grid."""
 
     def waveform(self, shape, context):
@@ -117,13 +117,13 @@ class Broken(type(OF["input_saturation"])):
 
 def test_the_grid_shape_stays_if_the_simulation_is_not_finite():
     recording = driven(lambda u: u.clamp(-1.37, 1.37))
-    fit = found(recording, Broken(), {"limit": 1.2})
+    fit = joint_fit(recording, Broken(), {"limit": 1.2})
     assert shape_fitted(fit) is fit
 
 
 def test_parameters_are_followed_by_logarithms_of_the_shape():
     recording = driven(lambda u: u.clamp(-1.37, 1.37))
-    fit = found(recording, OF["input_saturation"], {"limit": 1.2})
+    fit = joint_fit(recording, EFFECTS["input_saturation"], {"limit": 1.2})
     reach = reach_of(fit.model.terms[-1], fit.model.prepared)
     largest = float(recording["drive"].abs().max())
     assert reach["limit"] == pytest.approx((0.2 * largest, 1.5 * largest))
@@ -140,7 +140,9 @@ def test_parameters_are_followed_by_logarithms_of_the_shape():
 
 def test_errors_equal_least_squares_with_the_shape_as_a_parameter():
     """In white normal noise: σ² (JᵀJ)⁻¹, J by differences of parameters and limit."""
-    fit = shape_fitted(found(driven(lambda u: u.clamp(-1.37, 1.37), seed=2), OF["input_saturation"], {"limit": 1.2}))
+    fit = shape_fitted(
+        joint_fit(driven(lambda u: u.clamp(-1.37, 1.37), seed=2), EFFECTS["input_saturation"], {"limit": 1.2})
+    )
     final = estimate(fit, NoiseSettings())
     shape, theta = final.fit.model.terms[-1].shape, final.fit.parameters
     (errors,) = final.shape_errors
@@ -168,7 +170,7 @@ def test_errors_equal_least_squares_with_the_shape_as_a_parameter():
 
 @pytest.mark.parametrize("wrong", [{"limit": (1.0, 1.0)}, {"limit": (2.0, 1.0)}, {"magic": (1.0, 2.0)}])
 def test_an_empty_range_raises(wrong):
-    fit = found(driven(lambda u: u.clamp(-1.37, 1.37)), OF["input_saturation"], {"limit": 1.2})
+    fit = joint_fit(driven(lambda u: u.clamp(-1.37, 1.37)), EFFECTS["input_saturation"], {"limit": 1.2})
     term = fit.model.terms[-1]
     effect = type("Mine", (type(term.effect),), {"fitted_shape": wrong})()
     with pytest.raises(ValueError, match=r"`fitted_shape` of input_saturation.*limit, softness.*got `\w+`"):

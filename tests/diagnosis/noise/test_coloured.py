@@ -1,4 +1,4 @@
-"""Shapes by the noise of the search, after a joint fit that assumes white noise."""
+"""Shape parameters under the coloured noise of the search, after a joint fit under white noise."""
 
 import dataclasses
 
@@ -21,12 +21,12 @@ N = 2000
 STEP = next(effect for effect in CATALOGUE if effect.id == "hard_iron_step")
 CUBIC = next(effect for effect in CATALOGUE if effect.id == "cubic_nonlinearity")
 FIRST, LAST = 990, 1040  # samples that are outliers
-TRUE = (FIRST + LAST) / 2.0 / RATE
+TRUE_ONSET = (FIRST + LAST) / 2.0 / RATE
 
 
 @pytest.fixture(scope="module")
 def burst():
-    """A step of 2 µT in the middle of a second of outliers."""
+    """Return the baseline fit of a recording with a step of 2 µT in the middle of a second of outliers."""
     sensor = np.zeros((N, 3))
     sensor[(FIRST + LAST) // 2 :] = [2.0, -1.0, 1.0]
     sensor[FIRST:LAST] += 400.0 * np.random.default_rng(1).choice([-1.0, 1.0], (LAST - FIRST, 3))
@@ -51,25 +51,25 @@ def with_shape(base, effect, shape):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("onset", [FIRST / RATE + 0.02, LAST / RATE - 0.02])
-def test_an_onset_in_a_burst_of_outliers_is_taken_from_its_middle(burst, onset):
+def test_an_onset_within_a_burst_of_outliers_is_the_middle_of_the_burst(burst, onset):
     best, look = with_shape(burst, STEP, {"onset": onset})
     assert float(look.scene.counts[FIRST:LAST].mean()) == 0.0
     moved = with_spectrum(best, look)
-    assert moved.model.terms[-1].shape["onset"] == pytest.approx(TRUE, abs=0.15)
+    assert moved.model.terms[-1].shape["onset"] == pytest.approx(TRUE_ONSET, abs=0.15)
     assert moved.converged
 
 
 @pytest.mark.e2e
-def test_an_onset_that_the_search_clearly_prefers_is_taken(burst):
-    best, *_ = with_shape(burst, STEP, {"onset": TRUE - 4.0})
-    _, look = with_shape(burst, STEP, {"onset": TRUE})
+def test_an_onset_of_much_higher_likelihood_replaces_that_of_the_fit(burst):
+    best, *_ = with_shape(burst, STEP, {"onset": TRUE_ONSET - 4.0})
+    _, look = with_shape(burst, STEP, {"onset": TRUE_ONSET})
     moved = with_spectrum(best, look)
-    assert abs(moved.model.terms[-1].shape["onset"] - TRUE) < 1.0
+    assert abs(moved.model.terms[-1].shape["onset"] - TRUE_ONSET) < 1.0
     assert moved.log_likelihood > best.log_likelihood + 10.0
 
 
 @pytest.mark.e2e
-def test_a_fit_without_shape_numbers_or_convergence_is_unchanged(burst, monkeypatch):
+def test_a_fit_without_shape_parameters_or_convergence_is_unchanged(burst, monkeypatch):
     best, look = with_shape(burst, CUBIC, {})
     assert with_spectrum(best, look) is best
     best, look = with_shape(burst, STEP, {"onset": FIRST / RATE + 0.02})
@@ -83,14 +83,14 @@ def test_a_fit_without_shape_numbers_or_convergence_is_unchanged(burst, monkeypa
 
 @given(st.lists(st.floats(-5.0, 5.0), min_size=1, max_size=20), st.data())
 @settings(deadline=None)
-def test_values_between_place_and_middle_are_alike(values, data):
+def test_values_between_an_index_and_its_plateau_middle_are_within_the_tolerance(values, data):
     place = data.draw(st.integers(0, len(values) - 1))
     found = middle(values, place, 0.5)
     between = values[min(found, place) : max(found, place) + 1]
     assert all(abs(value - values[place]) < 0.5 for value in between)
 
 
-def test_the_middle_of_a_plateau_is_its_middle_from_any_place():
+def test_the_middle_of_a_plateau_does_not_depend_on_the_start_index():
     values = [0.0, 3.0, *[9.0] * 7, 2.0]
     assert [middle(values, place, 0.5) for place in range(2, 9)] == [5] * 7
     assert middle(values, 0, 0.5) == 0

@@ -24,7 +24,7 @@ def noise_spectrum(*spectra):
     return NoiseSpectrum(tuple(root.new_zeros(0) for _ in spectra), root)
 
 
-def falling(size, kept=None):
+def falling_spectrum(size, kept=None):
     k = torch.arange(size if kept is None else kept, dtype=torch.float64)
     return 1.0 + 40.0 / (1.0 + (k / 5.0).square())
 
@@ -34,7 +34,7 @@ def mask(seed, size=N, channels=1, share=0.2):
     return (torch.rand(size, channels, generator=generator) > share).double()
 
 
-def expected(values, counts, spectrum):
+def conditional_expectation(values, counts, spectrum):
     """Return series with the conditional expectation at rejected samples, and log det of the precision there."""
     rows = basis(len(values), len(values))
     precision = rows.mT @ torch.diag(1.0 / spectrum) @ rows
@@ -49,7 +49,7 @@ def expected(values, counts, spectrum):
 @given(st.integers(0, 1000), st.sampled_from([0.05, 0.3, 0.6]))
 def test_the_imputation_is_the_conditional_expectation(seed, share):
     counts = mask(seed, channels=2, share=share)
-    spectra = falling(N), 0.5 + 10.0 * torch.linspace(0.0, 1.0, N, dtype=torch.float64).square()
+    spectra = falling_spectrum(N), 0.5 + 10.0 * torch.linspace(0.0, 1.0, N, dtype=torch.float64).square()
     values = counts * torch.randn(N, 2, generator=torch.Generator().manual_seed(seed)).double()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(imputation, "_PLAIN", 0.0)
@@ -58,7 +58,7 @@ def test_the_imputation_is_the_conditional_expectation(seed, share):
     found = filling(dct(values))
     total = 0.0
     for channel, spectrum in enumerate(spectra):
-        series, log_det = expected(values[:, channel], counts[:, channel], spectrum / spectrum[-1])
+        series, log_det = conditional_expectation(values[:, channel], counts[:, channel], spectrum / spectrum[-1])
         torch.testing.assert_close(found[:, channel], dct(series))
         total += float(log_det)
     assert filling.log_det == pytest.approx(total, abs=1e-8)
@@ -69,7 +69,7 @@ def test_the_imputation_is_the_conditional_expectation(seed, share):
 def test_solving_by_samples_equals_solving_by_frequencies(share, level):
     counts = mask(11, share=share)
     known, rows = MissingSamples(counts, N), torch.arange(0, N, 2)
-    excess = (level / falling(N) - 1.0)[rows]
+    excess = (level / falling_spectrum(N) - 1.0)[rows]
     assert bool((excess < 0).all()) == (level == 1.0)
     by_sample, by_frequency = known._by_sample(0, rows, excess), known._by_frequency(0, rows, excess)
     values = torch.randn(N, 3, generator=torch.Generator().manual_seed(12), dtype=torch.float64)
@@ -82,28 +82,29 @@ def test_frequencies_that_are_left_out_count_as_white():
     counts = mask(1)
     values = counts * torch.randn(N, 1, generator=torch.Generator().manual_seed(2)).double()
     kept = 30
-    found = MissingSamples(counts, kept).filling(noise_spectrum(falling(N, kept)))(dct(values, kept))
-    spectrum = falling(N, kept)
+    found = MissingSamples(counts, kept).filling(noise_spectrum(falling_spectrum(N, kept)))(dct(values, kept))
+    spectrum = falling_spectrum(N, kept)
     end = spectrum[-1]
     whole = torch.cat([torch.where((end / spectrum - 1.0).abs() > 0.3, spectrum, end), end.expand(N - kept)])
-    series, _ = expected(values[:, 0], counts[:, 0], whole / end)
+    series, _ = conditional_expectation(values[:, 0], counts[:, 0], whole / end)
     torch.testing.assert_close(found[:, 0], dct(series, kept))
 
 
 @pytest.mark.parametrize(
-    ("counts", "spectrum"), [(mask(3), torch.full((N,), 2.0).double()), (torch.ones(N, 1).double(), falling(N))]
+    ("counts", "spectrum"),
+    [(mask(3), torch.full((N,), 2.0).double()), (torch.ones(N, 1).double(), falling_spectrum(N))],
 )
-def test_white_noise_and_a_whole_recording_are_left_as_they_are(counts, spectrum):
+def test_imputation_leaves_white_noise_and_complete_recordings_unchanged(counts, spectrum):
     values = dct(counts * torch.randn(N, 1, generator=torch.Generator().manual_seed(4)).double())
     filling = MissingSamples(counts, N).filling(noise_spectrum(spectrum))
     assert filling(values) is values
     assert filling.log_det == 0.0
 
 
-def test_amplitudes_are_left_what_they_are():
+def test_imputation_is_linear():
     counts, course = mask(5), torch.randn(N, 1, 2, generator=torch.Generator().manual_seed(6)).double()
     gamma = torch.tensor([2.0, -3.0], dtype=torch.float64)
-    filling = MissingSamples(counts, N).filling(noise_spectrum(falling(N)))
+    filling = MissingSamples(counts, N).filling(noise_spectrum(falling_spectrum(N)))
     masked = counts.unsqueeze(-1) * course
     torch.testing.assert_close(filling(dct(masked @ gamma)), filling(dct(masked)) @ gamma)
 
@@ -113,9 +114,11 @@ def test_only_the_most_coloured_frequencies_are_kept(limit, value, monkeypatch):
     counts = mask(7)
     values = counts * torch.randn(N, 1, generator=torch.Generator().manual_seed(8)).double()
     monkeypatch.setattr(imputation, limit, value)
-    found = MissingSamples(counts, N).filling(noise_spectrum(falling(N)))(dct(values))
-    end = falling(N)[-3:].mean()
-    series, _ = expected(values[:, 0], counts[:, 0], torch.where(torch.arange(N) < 12, falling(N), end) / end)
+    found = MissingSamples(counts, N).filling(noise_spectrum(falling_spectrum(N)))(dct(values))
+    end = falling_spectrum(N)[-3:].mean()
+    series, _ = conditional_expectation(
+        values[:, 0], counts[:, 0], torch.where(torch.arange(N) < 12, falling_spectrum(N), end) / end
+    )
     torch.testing.assert_close(found[:, 0], dct(series))
 
 

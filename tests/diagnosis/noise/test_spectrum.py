@@ -45,7 +45,7 @@ def coloured(phi, N, seed=0):
 
 @pytest.mark.parametrize("N", [1, 2, 3, 8, 9, 360, 4501])
 @pytest.mark.parametrize("rest", [(), (3,), (2, 3)])
-def test_the_cosine_transform_is_scipys(N, rest):
+def test_the_cosine_transform_agrees_with_scipy(N, rest):
     values = randn(N, *rest)
     expected = scipy.fft.dct(values.numpy(), axis=0, norm="ortho")
     np.testing.assert_allclose(dct(values), expected, atol=1e-11)
@@ -54,7 +54,7 @@ def test_the_cosine_transform_is_scipys(N, rest):
 
 
 @pytest.mark.parametrize(("N", "kept", "courses"), [(20, 20, 3), (21, 9, 4), (40, 40, 4), (61, 61, 6)])
-def test_the_transform_of_modulated_courses_is_that_of_their_products(N, kept, courses):
+def test_the_transform_of_modulated_courses_is_the_transform_of_their_products(N, kept, courses):
     values = randn(N, 2, 3)
     products = values[:, :, None, :] * cosines(courses, N)[:, None, :, None]
     expected = scipy.fft.dct(products.flatten(2).numpy(), axis=0, norm="ortho")[:kept]
@@ -132,7 +132,7 @@ def test_the_spectrum_whitens_an_autoregression(phi):
     assert float(lags.abs().max()) < 0.06
 
 
-def test_the_spectrum_has_the_autoregression():
+def test_the_spectrum_has_order_and_coefficients_of_the_autoregression():
     found = spectrum_of(dct(coloured(AR2.numpy(), 6000).unsqueeze(-1)).square())
     assert found.order == 2
     torch.testing.assert_close(found.coefficients[0], AR2, rtol=0.0, atol=0.05)
@@ -257,7 +257,7 @@ def test_least_squares_on_pseudo_residuals_is_the_robust_estimate_to_first_order
     assert abs(np.mean(draws)) < 4.0 * np.std(draws) / math.sqrt(40)
 
 
-def test_the_spread_of_pseudo_residuals_is_that_of_the_estimate():
+def test_the_spread_of_pseudo_residuals_equals_the_spread_of_the_estimate():
     error = torch.from_numpy(stats.t(4).rvs(4000, random_state=0)).unsqueeze(-1)
     found = fit_density(error)
     values, counts = pseudo_residual(error, found.sigma, found.d, 0.1)

@@ -64,14 +64,14 @@ def test_diagnose_checks_the_declarations():
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
-def test_an_output_that_never_changes_is_rejected(value):
+def test_a_constant_output_raises_with_its_value(value):
     time = torch.arange(200, dtype=torch.float64) * STEP
     stuck = Recording({"time": time, "angle": torch.full_like(time, value), "torque": time.sin()})
     with pytest.raises(ValueError, match=rf"`angle` is {value:g} in all samples"):
         diagnose(Pendulum(), stuck)
 
 
-def test_progress_that_is_no_function_is_rejected():
+def test_progress_of_another_type_raises():
     time = torch.arange(200, dtype=torch.float64) * STEP
     swinging = Recording({"time": time, "angle": time.cos(), "torque": time.sin()})
     with pytest.raises(TypeError, match=r"`progress`.*got 3"):

@@ -23,12 +23,12 @@ def noise(seed):
 
 
 @pytest.mark.parametrize(("size", "better"), [(0.0, False), (0.02, False), (1.0, True)])
-def test_the_last_finding_has_to_gain_beyond_its_price(size, better):
+def test_the_last_finding_needs_a_gain_above_its_penalty(size, better):
     decay = size * torch.exp(-(torch.arange(SAMPLES) % 100) / 10.0)
     assert _clearly_better(fits(noise(0) + decay, noise(0)), 0, NamingSettings()) is better
 
 
-def test_an_earlier_finding_is_not_judged_by_the_gain_of_a_later_one():
+def test_the_gain_of_a_later_finding_does_not_count_for_an_earlier_finding():
     decay = torch.exp(-(torch.arange(SAMPLES) % 100) / 10.0)
     three = fits(noise(0) + 2.0 * decay, noise(0) + decay, noise(0))
     assert not _clearly_better(three, 0, NamingSettings())

@@ -1,4 +1,4 @@
-"""An effect of a column whose timing is doubted gives way to an effect of time alone that is nearly as likely."""
+"""A drift replaces an effect of a column with uninformative timing if it is nearly as likely."""
 
 import dataclasses
 import types
@@ -28,8 +28,8 @@ def fit(of):
 
 
 @dataclasses.dataclass(frozen=True)
-class Located:
-    """The parts of a search result that are read."""
+class SearchResultStub:
+    """The attributes of a search result that are used."""
 
     term: Any
     fit: Any
@@ -38,26 +38,26 @@ class Located:
     look: Any = None
 
 
-def decided(rival, gap, monkeypatch, *, shift=DOUBTED, refit=lambda _, of, *__: fit(of)):
-    """A temperature's effect ahead of a rival."""
+def selected(rival, gap, monkeypatch, *, shift=DOUBTED, refit=lambda _, of, *__: fit(of)):
+    """Return the selection between a leading effect of temperature and a rival."""
     warmed = term("temperature_offset", driver="temperature")
     monkeypatch.setattr(doubted_driver, "shifted", lambda *_: shift)
     monkeypatch.setattr(doubted_driver, "refitted", refit)
     ranking = (Ranked(0, 90.0, 0.0), Ranked(1, 80.0, gap))
-    found = Located(warmed, fit(warmed), ranking, types.SimpleNamespace(terms=[warmed, rival]))
+    found = SearchResultStub(warmed, fit(warmed), ranking, types.SimpleNamespace(terms=[warmed, rival]))
     return with_driver_or_time(types.SimpleNamespace(model=None), found, SETTINGS)
 
 
-def test_a_drift_goes_before_a_column_whose_shifted_copies_gain_as_much(monkeypatch):
-    found = decided(term("offset_drift"), NEAR, monkeypatch)
+def test_a_drift_replaces_a_column_whose_shifted_copies_gain_as_much(monkeypatch):
+    found = selected(term("offset_drift"), NEAR, monkeypatch)
     assert found.term.effect.id == found.fit.model.terms[-1].effect.id == "offset_drift"
     # the column's effect stays an alternative that the recording does not distinguish
     assert [(rival.number, rival.gap) for rival in found.ranking] == [(1, 0.0), (0, 0.0)]
 
 
 @pytest.mark.parametrize("shift", [TIMED, None], ids=["timed", "not shifted"])
-def test_a_column_with_its_own_timing_stays_first(shift, monkeypatch):
-    assert decided(term("offset_drift"), NEAR, monkeypatch, shift=shift).term.effect.id == "temperature_offset"
+def test_a_column_with_informative_timing_stays_first(shift, monkeypatch):
+    assert selected(term("offset_drift"), NEAR, monkeypatch, shift=shift).term.effect.id == "temperature_offset"
 
 
 @pytest.mark.parametrize(
@@ -70,12 +70,12 @@ def test_a_column_with_its_own_timing_stays_first(shift, monkeypatch):
     ],
     ids=["far behind", "another column", "a curve", "another port"],
 )
-def test_no_other_rival_takes_the_place(rival, gap, monkeypatch):
-    assert decided(rival, gap, monkeypatch).term.effect.id == "temperature_offset"
+def test_a_rival_that_is_distant_or_not_a_drift_does_not_replace_the_column(rival, gap, monkeypatch):
+    assert selected(rival, gap, monkeypatch).term.effect.id == "temperature_offset"
 
 
 def test_a_drift_without_a_fit_changes_nothing(monkeypatch):
     def failing(*_):
         raise NoFitError("no finite trajectory")
 
-    assert decided(term("offset_drift"), NEAR, monkeypatch, refit=failing).term.effect.id == "temperature_offset"
+    assert selected(term("offset_drift"), NEAR, monkeypatch, refit=failing).term.effect.id == "temperature_offset"

@@ -1,4 +1,4 @@
-"""Further searches after a finding: a search that fails changes nothing of the findings."""
+"""Further searches after a finding; a failed search keeps the findings."""
 
 import importlib
 from dataclasses import replace
@@ -18,7 +18,7 @@ stepwise = importlib.import_module("mkc_torch.diagnosis.pipeline.stepwise")
 steps = importlib.import_module("mkc_torch.diagnosis.pipeline.steps")
 
 
-ANYWAY = replace(Settings(), evidence=replace(Settings().evidence, followed=0.0))
+POOR_FIT_SETTINGS = replace(Settings(), evidence=replace(Settings().evidence, followed=0.0))
 """Settings that allow several findings for a simulation with a poor fit."""
 
 EFFECTS = [effect for effect in CATALOGUE if effect.id in ("cubic_stiffness", "quadratic_drag")]
@@ -64,7 +64,7 @@ def diagnosed(recording, monkeypatch):
 
         monkeypatch.setattr(stepwise, "_located", search)
         monkeypatch.setattr(stepwise, "_is_screened_out", lambda *_: False)
-        return diagnose(Sled(), recording, effects=EFFECTS, settings=ANYWAY), searches
+        return diagnose(Sled(), recording, effects=EFFECTS, settings=POOR_FIT_SETTINGS), searches
 
     return run
 
@@ -95,7 +95,7 @@ def test_a_diverging_search_does_not_change_the_findings(diagnosed, recording):
         base.model.residual(1.01 * base.parameters)
         return replace(first, p_value=1.0)
 
-    (plain, *_) = diagnose(Sled(), recording, effects=EFFECTS, settings=ANYWAY).findings
+    (plain, *_) = diagnose(Sled(), recording, effects=EFFECTS, settings=POOR_FIT_SETTINGS).findings
     diagnosis, searches = diagnosed(diverging)
     assert len(searches) == 2
     (finding,) = diagnosis.findings
@@ -107,14 +107,14 @@ def test_a_diverging_search_does_not_change_the_findings(diagnosed, recording):
 
 
 @pytest.mark.e2e
-def test_candidates_of_an_impossible_sign_are_no_findings(recording):
+def test_candidates_of_an_impossible_sign_are_not_findings(recording):
     diagnosis = diagnose(Sled(), recording, effects=EFFECTS)
     assert len(diagnosis.findings) == 1  # further candidates have an impossible sign
     assert not any("failed" in warning for warning in diagnosis.warnings)
 
 
 @pytest.mark.e2e
-def test_an_effect_that_makes_the_fit_diverge_is_found_from_the_initial_values(recording):
+def test_an_effect_whose_fit_diverges_is_refitted_from_the_initial_values(recording):
     """Without its spring the sled is fitted with a damping of thousands, where a spring has the wrong size."""
     diagnosis = diagnose(Sled(), recording, effects=EFFECTS)
     assert diagnosis.environment.goodness_of_fit[0].explained < 0.5
@@ -127,8 +127,8 @@ def test_an_effect_that_makes_the_fit_diverge_is_found_from_the_initial_values(r
 
 
 @pytest.mark.parametrize("refused", [(), ("first",), ("first", "second")])
-def test_a_candidate_that_enlarges_the_open_loop_residual_gives_way_to_the_next(monkeypatch, refused):
-    """The names are those of the candidates that enlarge it; the search is repeated once."""
+def test_a_candidate_that_enlarges_the_open_loop_residual_is_replaced_by_the_next(monkeypatch, refused):
+    """``refused`` names the candidates that enlarge it; the search is repeated once."""
     terms = tuple(SimpleNamespace(key=name) for name in ("first", "second", "third"))
     known = SimpleNamespace(fit="without", term=SimpleNamespace(key="known"))
 
@@ -153,7 +153,7 @@ def test_a_candidate_that_enlarges_the_open_loop_residual_gives_way_to_the_next(
 
 @pytest.mark.parametrize(("terms", "start"), [((), "first"), (("found",), "open loop with the findings")])
 def test_a_further_search_also_starts_from_the_open_loop(monkeypatch, terms, start):
-    """Process noise of the fit with the findings hides what the open loop shows: a constant force, for example."""
+    """Process noise of the fit with the findings can mask an effect, such as a constant force."""
     fit = SimpleNamespace(model=SimpleNamespace(terms=terms))
     options = SimpleNamespace(level=0.05, surrogates=9, declared={}, fixed={}, settings=None, quick=False)
     monkeypatch.setattr(stepwise, "has_process_noise", lambda _: True)
@@ -162,7 +162,7 @@ def test_a_further_search_also_starts_from_the_open_loop(monkeypatch, terms, sta
     assert stepwise._located(fit, (), options, torch.Generator(), free="first") == start
 
 
-def test_two_findings_that_only_hold_each_other_up_end_the_search(monkeypatch):
+def test_two_jointly_needless_findings_end_the_search(monkeypatch):
     monkeypatch.setattr(steps, "needless_terms", lambda *_: (0, 1))
     monkeypatch.setattr(steps, "without", lambda *_: "nothing")
     monkeypatch.setattr(steps, "improves_open_loop", lambda *_: False)

@@ -1,4 +1,4 @@
-"""Stopped diagnoses and quick looks: they report what is known and what was not done."""
+"""Stopped diagnoses and quick looks report partial results and the skipped steps."""
 
 import json
 import math
@@ -17,7 +17,7 @@ from mkc_torch.diagnosis.search.significance import pays, price
 from mkc_torch.recording.demonstration import concealed_recording
 from mkc_torch.report import diagnosis_report
 from mkc_torch.simulation import Magnetometer
-from tests.diagnosis.test_dynamics_diagnosis import Pendulum, swung
+from tests.diagnosis.test_dynamics_diagnosis import Pendulum, pendulum_recording
 
 QUICK = {"surrogates": 19, "max_findings": 1}
 NOT_FINISHED = "The search was stopped"
@@ -43,10 +43,10 @@ def magnetometer():
 
 
 def pendulum():
-    return Pendulum(), swung(lambda _, speed: -0.8 * speed * abs(speed))
+    return Pendulum(), pendulum_recording(lambda _, speed: -0.8 * speed * abs(speed))
 
 
-def checked(result):
+def assert_stop_is_reported(result):
     """Check that the files of a stopped diagnosis can be written and report the stop."""
     content = json.loads(diagnosis_to_json(result))
     assert content["search"]["stopped"]["reason"] == "time limit"
@@ -62,14 +62,14 @@ def checked(result):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("case", [magnetometer, pendulum])
-def test_a_diagnosis_stopped_anywhere_reports_what_is_known(monkeypatch, case):
+def test_a_diagnosis_stopped_at_any_check_reports_partial_results(monkeypatch, case):
     simulation, recording = case()
     all_steps = Steps(monkeypatch)
     assert diagnose(simulation, recording, **QUICK).stop is None
     seen = set()
     for share in (0.2, 0.4, 0.6, 0.8, 0.95):
         Steps(monkeypatch, round(share * all_steps.count))
-        result = checked(diagnose(simulation, recording, **QUICK))
+        result = assert_stop_is_reported(diagnose(simulation, recording, **QUICK))
         seen.add(result.stop.not_done)
         if result.p_value is None:
             assert (result.candidates, result.candidates_tried, result.findings) == ((), 0, ())
@@ -94,14 +94,14 @@ def test_a_stop_before_the_first_fit_raises(monkeypatch):
 
 @pytest.mark.e2e
 @pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked elsewhere")
-def test_worker_processes_end_with_a_stop(monkeypatch):
+def test_a_stop_ends_worker_processes(monkeypatch):
     simulation, recording = pendulum()
     steps = Steps(monkeypatch)
     allow_copies(1)
     try:
         diagnose(simulation, recording, **QUICK)
         Steps(monkeypatch, steps.count // 2)
-        checked(diagnose(simulation, recording, **QUICK))
+        assert_stop_is_reported(diagnose(simulation, recording, **QUICK))
     finally:
         allow_copies(0)
     assert multiprocessing.active_children() == []
@@ -137,12 +137,12 @@ def test_a_quick_look_finds_the_same_without_surrogates(monkeypatch, case, effec
     assert content["warnings"][0].startswith("Quick look: no p-values, false-alarm rate not controlled. Left out: ")
     page = diagnosis_report(result)
     assert page.index("Quick look: no p-values") < page.index("<h1")
-    assert result.advice[0] == "Confirm it by a full diagnosis."
+    assert "full diagnosis" in result.advice[0]
 
 
 @pytest.mark.e2e
 def test_a_quick_look_at_noise_finds_nothing():
-    simulation, recording = pendulum()[0], swung(lambda *_: 0.0)
+    simulation, recording = pendulum()[0], pendulum_recording(lambda *_: 0.0)
     result = diagnose(simulation, recording, quick=True)
     assert (result.verdict, result.findings, result.p_value) == ("adequate", (), None)
 
@@ -156,10 +156,8 @@ def test_the_penalty_grows_with_numbers_samples_and_candidates():
 
 def test_the_stop_comes_before_the_quick_look():
     sentences = notices(Stop("interrupt", 12.3, ("the search for effects", "the other tests")), quick=True)
-    assert sentences[0] == (
-        "Stopped by an interrupt after 12 s: the search was not finished; not done: the search for effects; the other "
-        "tests."
-    )
+    assert sentences[0].startswith("Stopped by an interrupt after 12 s")
+    assert "not done: the search for effects; the other tests" in sentences[0]
     assert sentences[1].startswith("Quick look")
     assert notices(None, quick=False) == ()
 

@@ -1,4 +1,4 @@
-"""Of an effect with a number for each part, the form with one for all is taken where unseen blocks allow it."""
+"""An effect with a parameter for each part is simplified to a shared parameter unless held-out blocks prefer it."""
 
 import math
 from dataclasses import replace
@@ -18,12 +18,12 @@ from mkc_torch.diagnosis.settings import ConfirmationSettings, NamingSettings, N
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics, Parameter
 
-OF = {effect.id: effect for effect in DYNAMICS}
+EFFECTS = {effect.id: effect for effect in DYNAMICS}
 N, FINE, STEP, NOISE = 400, 20, 0.1, 0.01
 
 
 class Bodies(Dynamics):
-    """Two heated bodies that are thought to be apart, each with a sensor that is thought to be quick."""
+    """Two heated bodies without exchange and with sensors without lag."""
 
     states = ("left", "right")
     inputs = ("heat",)
@@ -35,8 +35,8 @@ class Bodies(Dynamics):
         return {"left": p.gain * u.heat - p.loss * x.left, "right": 0.5 * p.gain * u.heat - p.loss * x.right}
 
 
-def recorded(exchange=(0.0, 0.0), share=(0.0, 0.0), lag=0.4, seed=0):
-    """By steps of a tenth of a sample, with a formula of their own."""
+def bodies_recording(exchange=(0.0, 0.0), share=(0.0, 0.0), lag=0.4, seed=0):
+    """Return a recording of two bodies with exchange and sensor lags, integrated independently."""
     generator = torch.Generator().manual_seed(seed)
     heat = torch.rand(N // 20, generator=generator, dtype=torch.float64).repeat_interleave(20)
     step = STEP / FINE
@@ -58,7 +58,7 @@ def recorded(exchange=(0.0, 0.0), share=(0.0, 0.0), lag=0.4, seed=0):
 
 
 def fit_of(recording, *effects, start=0.3):
-    """The joint fit with these effects, as a search finds them, and its evidence."""
+    """Return the joint fit with these effects, as a search finds them, and its evidence."""
     prepared = Bodies().prepare(recording)
     terms = [candidate_terms(prepared, (), (effect,))[0] for effect in effects]
     terms = [replace(t, shape={"lag": 0.5}) if t.effect.id == "sensor_lag" else t for t in terms]
@@ -70,16 +70,16 @@ def fit_of(recording, *effects, start=0.3):
     return fit, held_out(fit, blocks), blocks
 
 
-def always(_fit, _evidence):
+def accept_all(_fit, _evidence):
     return True
 
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("seed", [0, 1])
-def test_sensors_that_are_alike_share_one_number(seed):
-    fit, evidence, blocks = fit_of(recorded(share=(1.0, 1.0), seed=seed), OF["sensor_lag"])
+def test_equal_sensor_lags_are_simplified_to_a_shared_lag(seed):
+    fit, evidence, blocks = fit_of(bodies_recording(share=(1.0, 1.0), seed=seed), EFFECTS["sensor_lag"])
     assert fit.model.sizes == (2,)
-    simple, after = simplified(fit, evidence, blocks, always, NamingSettings())
+    simple, after = simplified(fit, evidence, blocks, accept_all, NamingSettings())
     assert simple.model.sizes == (1,)
     lag = simple.model.terms[0].shape["lag"]  # fitted again
     assert lag != 0.5
@@ -89,9 +89,9 @@ def test_sensors_that_are_alike_share_one_number(seed):
 
 
 @pytest.mark.e2e
-def test_where_one_sensor_is_quick_each_keeps_its_own():
-    fit, evidence, blocks = fit_of(recorded(share=(1.0, 0.0)), OF["sensor_lag"])
-    kept, after = simplified(fit, evidence, blocks, always, NamingSettings())
+def test_different_sensor_lags_keep_separate_shares():
+    fit, evidence, blocks = fit_of(bodies_recording(share=(1.0, 0.0)), EFFECTS["sensor_lag"])
+    kept, after = simplified(fit, evidence, blocks, accept_all, NamingSettings())
     assert kept is fit
     assert after is evidence
     assert fit.parameters[-2:].tolist() == pytest.approx([1.0, 0.0], abs=0.2)
@@ -99,16 +99,16 @@ def test_where_one_sensor_is_quick_each_keeps_its_own():
 
 @pytest.mark.e2e
 @pytest.mark.parametrize(("exchange", "size"), [((0.2, 0.2), 1), ((0.3, 0.1), 2)])
-def test_what_equals_exchange_is_one_number(exchange, size):
-    fit, evidence, blocks = fit_of(recorded(exchange), OF["coupling"], start=0.1)
-    simple, _ = simplified(fit, evidence, blocks, always, NamingSettings())
+def test_a_symmetric_exchange_is_simplified_to_a_shared_coefficient(exchange, size):
+    fit, evidence, blocks = fit_of(bodies_recording(exchange), EFFECTS["coupling"], start=0.1)
+    simple, _ = simplified(fit, evidence, blocks, accept_all, NamingSettings())
     assert simple.model.sizes == (size,)
     assert simple.parameters[-size:].tolist() == pytest.approx(list(exchange[:size]), abs=0.02)
 
 
 @pytest.mark.e2e
-def test_a_form_that_makes_no_finding_any_more_is_not_taken():
-    fit, evidence, blocks = fit_of(recorded((0.2, 0.2)), OF["coupling"], start=0.1)
+def test_a_simpler_form_that_is_rejected_as_a_finding_is_not_used():
+    fit, evidence, blocks = fit_of(bodies_recording((0.2, 0.2)), EFFECTS["coupling"], start=0.1)
     asked = []
 
     def never(other, after):
@@ -121,30 +121,32 @@ def test_a_form_that_makes_no_finding_any_more_is_not_taken():
 
 @pytest.mark.e2e
 def test_an_earlier_effect_is_simplified_in_the_presence_of_a_later_one():
-    fit, evidence, blocks = fit_of(recorded((0.3, 0.1), (1.0, 1.0)), OF["sensor_lag"], OF["coupling"], start=0.2)
-    simple, _ = simplified(fit, evidence, blocks, always, NamingSettings())
+    fit, evidence, blocks = fit_of(
+        bodies_recording((0.3, 0.1), (1.0, 1.0)), EFFECTS["sensor_lag"], EFFECTS["coupling"], start=0.2
+    )
+    simple, _ = simplified(fit, evidence, blocks, accept_all, NamingSettings())
     assert simple.model.sizes == (1, 2)
     assert simple.parameters[simple.model.base :].tolist() == pytest.approx([1.0, 0.3, 0.1], abs=0.1)
 
 
-def test_an_effect_without_a_simpler_form_stays():
-    fit, evidence, blocks = fit_of(recorded(), OF["linear_drag"], start=0.0)
-    assert simplified(fit, evidence, blocks, always, NamingSettings()) == (fit, evidence)
+def test_an_effect_without_a_simpler_form_is_unchanged():
+    fit, evidence, blocks = fit_of(bodies_recording(), EFFECTS["linear_drag"], start=0.0)
+    assert simplified(fit, evidence, blocks, accept_all, NamingSettings()) == (fit, evidence)
 
 
 @pytest.mark.e2e
-def test_the_simpler_form_is_written_and_read_like_the_other():
-    recording = recorded((0.2, 0.2))
-    simple, _ = simplified(*fit_of(recording, OF["coupling"], start=0.1), always, NamingSettings())
+def test_a_model_with_a_simpler_form_is_restored_from_json():
+    recording = bodies_recording((0.2, 0.2))
+    simple, _ = simplified(*fit_of(recording, EFFECTS["coupling"], start=0.1), accept_all, NamingSettings())
     model = model_of(estimate(simple, NoiseSettings()), Bodies())
     again = DiagnosedModel.from_json(model.to_json(), simulation=Bodies())
     torch.testing.assert_close(again(recording)["left"], model(recording)["left"])
 
 
-def test_every_simpler_form_has_fewer_numbers():
+def test_every_simpler_form_has_fewer_parameters():
     nested = [effect for effect in DYNAMICS if effect.simpler is not None]
     assert {effect.id for effect in nested} == {"coupling", "sensor_lag"}
-    prepared = Bodies().prepare(recorded())
+    prepared = Bodies().prepare(bodies_recording())
     for effect in nested:
         (term, *_) = candidate_terms(prepared, (), (effect,))
         context = term.context(prepared, prepared.signals(prepared.start(), {})[term.port])
@@ -166,7 +168,7 @@ class Slide(Dynamics):
         return {"place": x.speed, "speed": p.gain * u.force - p.spring * x.place}
 
 
-def test_friction_without_a_share_of_the_load_is_dry_friction():
+def test_load_dependent_friction_without_load_dependence_is_simplified_to_dry_friction():
     time = STEP * torch.arange(N, dtype=torch.float64)
     force = torch.sin(0.7 * time)
     place, speed, places = 0.0, 0.0, []
@@ -179,11 +181,11 @@ def test_friction_without_a_share_of_the_load_is_dry_friction():
     prepared = Slide().prepare(
         Recording({"time": time, "force": force, "place": torch.tensor(places).double() + noise})
     )
-    (*_, term) = candidate_terms(prepared, (), (OF["load_dependent_friction"],))  # the steepest
+    (*_, term) = candidate_terms(prepared, (), (EFFECTS["load_dependent_friction"],))  # the steepest
     base = fitted(JointModel(prepared), prepared.start())
     fit = fitted(base.model.with_term(term), torch.cat([base.parameters, torch.zeros(2).double()]), base.bound)
     blocks = blocks_of(N, 1, ConfirmationSettings())
-    simple, _ = simplified(fit, held_out(fit, blocks), blocks, always, NamingSettings())
+    simple, _ = simplified(fit, held_out(fit, blocks), blocks, accept_all, NamingSettings())
     (found,) = simple.model.terms
     assert (found.effect.id, found.port) == ("coulomb_friction", "rate of speed")
     assert found.key in {t.key for t in candidate_terms(prepared, (), DYNAMICS)}

@@ -1,4 +1,4 @@
-"""A general form gives way to its special case unless held-out blocks prefer the general form."""
+"""A special case replaces its general form unless held-out blocks prefer the general form."""
 
 import dataclasses
 import types
@@ -23,13 +23,13 @@ def term(name, *, general=False, curve=False, port="rate of speed"):
 
 
 def fit(of, better):
-    """A fit whose held-out samples are more likely by that many nats each, with noise."""
+    """Return a fit whose held-out samples are more likely by that many nats each, with noise."""
     return types.SimpleNamespace(model=types.SimpleNamespace(terms=[of]), better=better)
 
 
 @dataclasses.dataclass(frozen=True)
-class Located:
-    """The parts of a search result that are read."""
+class SearchResultStub:
+    """The attributes of a search result that are used."""
 
     term: Any
     fit: Any
@@ -39,11 +39,11 @@ class Located:
 
 
 def located(special, gap, *, general_better=0.0):
-    """A power law ahead of a special case, without and with a lead on held-out blocks."""
+    """Return a search result in which a power law is ahead of a special case."""
     power = term("power_law", general=True)
     fits = [fit(power, general_better), fit(special, 0.0)]
     ranking = (Ranked(0, 20.0, 0.0), Ranked(1, 18.0, gap))
-    return Located(power, fits[0], fits, ranking, types.SimpleNamespace(terms=[power, special]))
+    return SearchResultStub(power, fits[0], fits, ranking, types.SimpleNamespace(terms=[power, special]))
 
 
 def scores(of):
@@ -51,13 +51,13 @@ def scores(of):
     return types.SimpleNamespace(log_likelihood=of.better + noise)
 
 
-def decided(found, scored=scores):
+def selected(found, scored=scores):
     blocks = blocks_of(SAMPLES, 1, Settings().confirmation)
     return with_special_case(found, scored, blocks, 0, SETTINGS)
 
 
-def test_drag_goes_before_a_power_of_the_speed_and_both_remain_candidates():
-    found = decided(located(term("quadratic_drag"), NEAR))
+def test_drag_replaces_a_power_law_that_stays_an_alternative():
+    found = selected(located(term("quadratic_drag"), NEAR))
     assert found.term.effect.id == found.fit.model.terms[-1].effect.id == "quadratic_drag"
     assert [(found.scene.terms[rival.number].effect.id, rival.gap) for rival in found.ranking] == [
         ("quadratic_drag", 0.0),
@@ -82,9 +82,9 @@ def test_drag_goes_before_a_power_of_the_speed_and_both_remain_candidates():
         "another general form",
     ],
 )
-def test_otherwise_the_general_form_stays(special, gap, better):
+def test_the_general_form_stays_unless_a_comparable_special_case_is_near(special, gap, better):
     found = located(special, gap, general_better=better)
-    assert decided(found) is found
+    assert selected(found) is found
 
 
 def test_a_special_case_that_cannot_be_scored_changes_nothing():
@@ -92,4 +92,4 @@ def test_a_special_case_that_cannot_be_scored_changes_nothing():
         raise NoFitError("No finite trajectory.")
 
     found = located(term("quadratic_drag"), NEAR)
-    assert decided(found, lost) is found
+    assert selected(found, lost) is found

@@ -41,7 +41,7 @@ def located(beyond, with_noise=False):
         (False, -0.5, 1.0, 100.0, False),
     ],
 )
-def test_when_a_candidate_counts(first, mean, spread, beyond, counts):
+def test_a_candidate_counts_by_its_held_out_gain_or_if_far_beyond_all_surrogates(first, mean, spread, beyond, counts):
     assert (
         holds(located(beyond), NOTHING, evidence(mean, spread), BLOCKS, 0, ConfirmationSettings(), first=first)
         is counts
@@ -54,7 +54,7 @@ def test_blocks_only_reject_if_noise_and_physics_were_selected_together(mean, co
     assert holds(candidate, NOTHING, evidence(mean, 1.0), BLOCKS, 0, ConfirmationSettings(), first=True) is counts
 
 
-def walks(step):
+def drifting_evidence(step):
     """Evidence with a small loss, and residuals with a random walk, with and without a fast course."""
     draws = torch.randn(N, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     drift = draws[:, 0].cumsum(0) + 0.1 * draws[:, 1]
@@ -65,14 +65,14 @@ def walks(step):
 
 
 def test_a_clear_gain_of_innovations_counts_under_drift():
-    before, after = walks(0.5)
+    before, after = drifting_evidence(0.5)
     assert innovation_gain(before.residual, after.residual) > 50.0
     assert holds(located(0.0), before, after, BLOCKS, 0, ConfirmationSettings(), first=True)
     assert not holds(located(0.0), before, after, BLOCKS, 0, ConfirmationSettings(), first=False)
 
 
 def test_a_gain_below_the_penalty_does_not_count():
-    before, after = walks(0.05)
+    before, after = drifting_evidence(0.05)
     assert innovation_gain(before.residual, after.residual) < 10.0
     assert not holds(located(0.0), before, after, BLOCKS, 0, ConfirmationSettings(), first=True)
 

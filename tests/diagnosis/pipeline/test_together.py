@@ -73,7 +73,7 @@ def test_recordings_share_parameters_and_have_their_own_initial_states():
     assert prepared.start()[1:].tolist() == pytest.approx([1.0, 3.0], abs=0.1)
 
 
-def moved(recording, column, by):
+def with_offset(recording, column, by):
     return Recording({**recording.columns, column: recording[column] + by}, name=recording.name)
 
 
@@ -90,7 +90,7 @@ class Coast(Dynamics):
 
 
 def coast(seed, name, offset, count=200, parts=100):
-    """A body of quadratic drag that the simulation lacks, its speed read off by an offset."""
+    """Return a recording of a body with hidden quadratic drag, whose speed has an offset."""
     time = torch.arange(count * parts, dtype=torch.float64) * 0.05 / parts
     force = 2.0 * torch.sin(0.7 * time + seed) + 1.5 * torch.sin(2.1 * time) + 1.0
     speed, now = torch.empty_like(time), 1.0 + seed
@@ -105,7 +105,7 @@ def coast(seed, name, offset, count=200, parts=100):
 @pytest.mark.e2e
 def test_offsets_are_per_recording_and_findings_are_common():
     parts = [coast(seed, name, offset) for seed, name, offset in ((0, "a", 0.3), (1, "b", -0.2), (2, "c", 0.0))]
-    recordings = [moved(part, "speed", added) for part, added in parts]
+    recordings = [with_offset(part, "speed", added) for part, added in parts]
     drag = tuple(effect for effect in CATALOGUE if effect.id == "quadratic_drag")
     result = diagnose(Coast(), recordings, effects=drag, surrogates=19)
     assert [finding.effect for finding in result.findings] == ["quadratic_drag"]
@@ -123,11 +123,15 @@ def test_offsets_are_per_recording_and_findings_are_common():
     assert not any("the same in all recordings" in sentence for sentence in result.advice)
 
 
-def test_an_offset_that_all_recordings_share_is_stated():
-    result = diagnose(Decay(), [moved(decay(k, n, 1.0 + k), "level", 0.3) for k, n in enumerate("ab")], effects=())
+def test_an_offset_common_to_all_recordings_is_reported():
+    result = diagnose(
+        Decay(), [with_offset(decay(k, n, 1.0 + k), "level", 0.3) for k, n in enumerate("ab")], effects=()
+    )
     (sentence,) = [s for s in result.advice if "the same in all recordings" in s]
     assert sentence.startswith("The offset of `level` is the same in all recordings: 0.3 ± 0.0")
-    apart = diagnose(Decay(), [moved(decay(k, n, 1.0 + k), "level", 0.3 * k) for k, n in enumerate("ab")], effects=())
+    apart = diagnose(
+        Decay(), [with_offset(decay(k, n, 1.0 + k), "level", 0.3 * k) for k, n in enumerate("ab")], effects=()
+    )
     assert not any("the same in all recordings" in s for s in apart.advice)
 
 
@@ -161,7 +165,7 @@ def test_offsets_are_per_recording_not_per_run():
 
 
 def test_a_static_simulation_has_offsets_per_recording():
-    recordings = [moved(line(0, "a"), "voltage", 0.3), moved(line(1, "b"), "voltage", -0.2)]
+    recordings = [with_offset(line(0, "a"), "voltage", 0.3), with_offset(line(1, "b"), "voltage", -0.2)]
     result = diagnose(Line(), recordings, effects=(), surrogates=19)
     assert rounded_offsets(result) == [("voltage", "a", 0.3), ("voltage", "b", -0.2)]
     assert result.verdict == "adequate"

@@ -43,13 +43,13 @@ class Largest(TorchDispatchMode):
         return made
 
 
-def of(fit, terms):
+def tangents_at(fit, terms):
     return tangents_of(fit.model, fit.parameters, Settings().noise, terms)
 
 
 def test_tangents_are_derivatives_of_the_joint_residual(sensor):
     fit, terms = sensor
-    found = of(fit, terms).candidates
+    found = tangents_at(fit, terms).candidates
     assert len(found) == len(terms)
     kinds = {term.effect.id: number for number, term in enumerate(terms)}
     assert len(kinds) >= 3
@@ -64,10 +64,10 @@ def test_tangents_are_derivatives_of_the_joint_residual(sensor):
 
 def test_recomputed_tangents_equal_cached_tangents(sensor, monkeypatch):
     fit, terms = sensor
-    held = of(fit, terms).candidates
+    held = tangents_at(fit, terms).candidates
     assert len(held._held) == len(terms)
     monkeypatch.setattr(blocks, "HELD", 0)
-    made = of(fit, terms).candidates
+    made = tangents_at(fit, terms).candidates
     assert not made._held
     for number in range(len(terms)):
         assert torch.equal(held[number], made[number])
@@ -77,13 +77,13 @@ def test_recomputed_tangents_equal_cached_tangents(sensor, monkeypatch):
 
 def test_the_cache_is_limited(sensor, monkeypatch):
     fit, terms = sensor
-    widest = max(tangent.numel() for tangent in of(fit, terms).candidates)
+    widest = max(tangent.numel() for tangent in tangents_at(fit, terms).candidates)
     monkeypatch.setattr(blocks, "HELD", 100_000)
-    held = sum(tangent.numel() for tangent in of(fit, terms).candidates._held.values())
+    held = sum(tangent.numel() for tangent in tangents_at(fit, terms).candidates._held.values())
     assert 100_000 <= held < 100_000 + widest
 
 
-def test_trajectories_are_solved_for_once(monkeypatch):
+def test_trajectories_are_solved_once_for_all_blocks(monkeypatch):
     monkeypatch.setattr(blocks, "HELD", 0)
     line = Line(200)
     fit = fitted(JointModel(line), line.start())
@@ -97,7 +97,7 @@ def test_a_search_in_small_blocks_gives_the_same_gains(sensor, monkeypatch):
     values, counts = fit.pseudo(Settings().noise)
 
     def gains():
-        search = linearise(fit.model, fit.parameters, values, counts, of(fit, terms))
+        search = linearise(fit.model, fit.parameters, values, counts, tangents_at(fit, terms))
         return search.search.gains(search.series.unsqueeze(-1)).ratio
 
     whole = gains()
@@ -128,8 +128,8 @@ def test_no_tensor_holds_all_candidates_of_a_long_recording(monkeypatch):
 
 def test_several_sets_are_a_single_sequence(sensor):
     fit, terms = sensor
-    first, second = of(fit, terms[:3]).candidates, of(fit, terms[3:5]).candidates
-    both, whole = one_after_the_other(first, second), of(fit, terms[:5]).candidates
+    first, second = tangents_at(fit, terms[:3]).candidates, tangents_at(fit, terms[3:5]).candidates
+    both, whole = one_after_the_other(first, second), tangents_at(fit, terms[:5]).candidates
     assert len(both) == 5
     assert all(torch.equal(a, b) for a, b in zip(both, whole, strict=True))
     assert [tangent.shape for tangent in both[2:4]] == [tangent.shape for tangent in whole[2:4]]

@@ -144,7 +144,7 @@ def test_coincident_outliers_are_rejected_in_all_channels():
 
 
 def attitude_error(seed, keep=0.998, size=0.8):
-    """The error in the body's axes of an attitude that drifts by about a degree, in µT."""
+    """Return the error in the body's axes of an attitude that drifts by about a degree, in µT."""
     drift = np.random.default_rng(seed).standard_normal((N, 3)) * size * np.sqrt(1.0 - keep**2)
     for n in range(1, N):
         drift[n] += keep * drift[n - 1]

@@ -13,13 +13,13 @@ from mkc_torch.diagnosis.search import own_noise
 from mkc_torch.diagnosis.search.own_noise import needless_terms, priced, without
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import DYNAMICS
-from tests.diagnosis.swing import candidates, fitted_swing
+from tests.diagnosis.swing import candidates, fitted_pendulum
 
 
 @functools.cache
 def with_effects(*names):
-    """A pendulum with hidden quadratic drag, fitted with these effects."""
-    base = fitted_swing("slow", drag=0.4).fit
+    """Return the fit of a pendulum with hidden quadratic drag, with these effects."""
+    base = fitted_pendulum("slow", drag=0.4).fit
     terms = candidates(base, DYNAMICS)
     model, start = base.model, base.parameters
     for name in names:
@@ -42,7 +42,7 @@ def test_a_single_effect_is_never_dropped():
     assert needless_terms(with_effects("quadratic_drag"), {}, Settings()) == ()
 
 
-def test_a_fit_without_two_effects():
+def test_without_removes_two_effects_at_once():
     fit = with_effects("constant_force", "quadratic_drag")
     less = without(fit, (0, 1), {}, Settings())
     assert less.model.terms == ()
@@ -50,7 +50,7 @@ def test_a_fit_without_two_effects():
 
 
 @pytest.mark.parametrize(("together", "needless"), [(-3.0, (0, 2)), (30.0, ())])
-def test_two_effects_that_only_hold_each_other_up_go_together(monkeypatch, together, needless):
+def test_two_jointly_needless_effects_are_removed_together(monkeypatch, together, needless):
     """Each pays its penalty given the other two; 0 and 2 together do not."""
     losses = {(0,): 40.0, (1,): 90.0, (2,): 25.0, (0, 1): 130.0, (0, 2): together, (1, 2): 120.0}
     monkeypatch.setattr(own_noise, "_loss", lambda _fit, numbers, *_: losses[numbers])

@@ -33,7 +33,7 @@ class Fan(Dynamics):
 
 
 @functools.cache
-def alone():
+def fan_fit():
     """Return the fit of the fan alone to steps of the voltage, of which the first 0.62 V have no effect."""
     generator = torch.Generator().manual_seed(3)
     levels = (0.7 + 0.6 * torch.rand(20, generator=generator)).double()
@@ -52,37 +52,37 @@ def alone():
 
 def candidates():
     effects = [effect for effect in DYNAMICS if effect.id in NAMES]
-    return candidate_terms(alone().model.prepared, (), effects)
+    return candidate_terms(fan_fit().model.prepared, (), effects)
 
 
-def test_a_wide_dead_zone_gains_by_its_fitted_width():
+def test_the_gain_of_a_wide_dead_zone_is_that_of_its_fitted_width():
     term = next(term for term in candidates() if term.effect.id == "dead_zone")
-    model = alone().model.with_term(term)
-    start = torch.cat([alone().parameters, torch.full((1,), 0.5).double()])
-    fit = fitted_with_effect(alone(), model, start, graduate=False)
-    prefer = ModelPrior(candidates(), alone().model.prepared, Settings().naming)
-    (shaped,) = _with_fitted_shapes({term.key: fit}, alone(), prefer, Settings().search).values()
+    model = fan_fit().model.with_term(term)
+    start = torch.cat([fan_fit().parameters, torch.full((1,), 0.5).double()])
+    fit = fitted_with_effect(fan_fit(), model, start, graduate=False)
+    prefer = ModelPrior(candidates(), fan_fit().model.prepared, Settings().naming)
+    (shaped,) = _with_fitted_shapes({term.key: fit}, fan_fit(), prefer, Settings().search).values()
     assert shaped.model.terms[-1].shape["width"] == pytest.approx(WIDTH, rel=0.05)
     assert shaped.log_likelihood > fit.log_likelihood + 100.0
 
 
 def test_fits_far_behind_keep_their_shapes_and_do_not_lead():
     term = next(term for term in candidates() if term.effect.id == "dead_zone")
-    model, prepared = alone().model.with_term(term), alone().model.prepared
+    model, prepared = fan_fit().model.with_term(term), fan_fit().model.prepared
     prefer, settings = ModelPrior(candidates(), prepared, Settings().naming), Settings().search
-    first = fitted_with_effect(alone(), model, torch.cat([alone().parameters, torch.full((1,), 0.5).double()]))
+    first = fitted_with_effect(fan_fit(), model, torch.cat([fan_fit().parameters, torch.full((1,), 0.5).double()]))
     far = replace(first, log_likelihood=first.log_likelihood - 1e4)
-    fits = _with_fitted_shapes({"first": first, "far": far}, alone(), prefer, settings)
+    fits = _with_fitted_shapes({"first": first, "far": far}, fan_fit(), prefer, settings)
     assert fits["far"] is far
     assert fits["first"] is not first
-    (leader,) = _leading([first, far], alone(), prefer, settings)
+    (leader,) = _leading([first, far], fan_fit(), prefer, settings)
     assert leader is first
-    assert len(_leading([first, replace(first)], alone(), prefer, settings)) == 2
+    assert len(_leading([first, replace(first)], fan_fit(), prefer, settings)) == 2
 
 
 def test_a_wide_dead_zone_leads_over_a_constant_force():
     terms, settings = candidates(), Settings()
-    prefer = ModelPrior(terms, alone().model.prepared, settings.naming)
-    fits, _ = strongest(alone(), terms, prefer, settings, parts=False)
+    prefer = ModelPrior(terms, fan_fit().model.prepared, settings.naming)
+    fits, _ = strongest(fan_fit(), terms, prefer, settings, parts=False)
     assert fits[0].model.terms[-1].effect.id == "dead_zone"
     assert float(fits[0].residual.std()) == pytest.approx(0.01, rel=0.15)

@@ -52,7 +52,7 @@ def all_terms(fit):
     return candidate_terms(fit.model.prepared, (), DYNAMICS)
 
 
-def test_missing_drag_leads_and_is_sized():
+def test_missing_drag_leads_with_its_size():
     fit = free_fit(DRAG)
     terms = all_terms(fit)
     runs, _ = free_runs(fit, terms, Settings())

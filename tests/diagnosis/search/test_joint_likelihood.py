@@ -12,7 +12,7 @@ from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid
-from tests.diagnosis.swing import at_the_truth, candidates, fitted_swing
+from tests.diagnosis.swing import candidates, fitted_pendulum, pendulum_at_truth
 
 DRAWS, LEVEL = 39, 0.05
 SEEDS = tuple(range(1, 5))
@@ -21,7 +21,7 @@ SEEDS = tuple(range(1, 5))
 @functools.cache
 def scene(noise, seed):
     """Return fit, candidates, tangents, and the mask of the residual."""
-    fit = at_the_truth(noise, seed)
+    fit = pendulum_at_truth(noise, seed)
     terms = candidates(fit, DYNAMICS)
     return fit, terms, tangents_of(fit.model, fit.parameters, NoiseSettings(), terms), torch.ones_like(fit.residual)
 
@@ -52,7 +52,7 @@ def test_p_values_under_process_noise_alone_are_not_small(noise):
 @functools.cache
 def hidden():
     """Search at the fit of a pendulum with a hidden quadratic drag."""
-    fit = fitted_swing("slow", drag=0.4).fit
+    fit = fitted_pendulum("slow", drag=0.4).fit
     terms = candidates(fit, DYNAMICS)
     tangents = tangents_of(fit.model, fit.parameters, NoiseSettings(), terms)
     parts = fit, terms, tangents, fit.pseudo(NoiseSettings())[1]

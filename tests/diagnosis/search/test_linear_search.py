@@ -164,7 +164,7 @@ def test_estimates_are_those_of_generalised_least_squares(search, number, size):
 
 
 @pytest.mark.parametrize("family", [0, 1])
-def test_a_size_is_as_unsure_as_the_least_favourable_family_that_is_nearly_as_likely(search, family):
+def test_standard_errors_are_those_of_the_least_favourable_nearly_as_likely_drift_family(search, family):
     series = drifting(100.0, family, seed=30) + 0.4 * CANDIDATES[2].sum(-1)
     fits = list(Dense(search).fits(series, CANDIDATES[2], NoiseSettings().walk_first))
     highest = max(fit[0] for fit in fits)

@@ -21,7 +21,7 @@ MILD, OTHERS = {400: -1.0}, {1200: 12.0, 1900: -9.0}
 """First sample of a burst, and its size along the field in µT."""
 
 
-def in_the_body(field):
+def in_sensor_frame(field):
     return turns(TIME).inv().apply(field)
 
 
@@ -29,13 +29,13 @@ def bursts(sizes, length=40):
     added = np.zeros((N, 3))
     for begin, size in sizes.items():
         added[begin : begin + length] = size * FIELD / np.linalg.norm(FIELD)
-    return in_the_body(added)
+    return in_sensor_frame(added)
 
 
 def pole(place, strength=0.02):
     """Return the field of a magnetic pole, strength in µT·m², along the path."""
     away = place - np.stack(list(POSITION.values()), -1)
-    return in_the_body(strength * away / (np.square(away).sum(-1, keepdims=True) + 0.06**2) ** 1.5)
+    return in_sensor_frame(strength * away / (np.square(away).sum(-1, keepdims=True) + 0.06**2) ** 1.5)
 
 
 def diagnosis_of(sensor):
@@ -47,7 +47,7 @@ def burst_warnings(diagnosis):
 
 
 @pytest.mark.e2e
-def test_a_single_burst_among_others_is_no_finding():
+def test_an_effect_that_explains_a_single_burst_is_not_a_finding():
     """A pole near the path would explain the mild burst only."""
     diagnosis = diagnosis_of(bursts(MILD | OTHERS))
     assert diagnosis.verdict == "unexplained"  # bursts are not white noise
@@ -74,7 +74,7 @@ def stretch():
     return trace, counts, torch.ones(1000, 2, 1, dtype=torch.float64)
 
 
-def test_the_stretch_contains_the_evidence(stretch):
+def test_the_stretch_contains_nearly_all_of_the_gain(stretch):
     trace, counts, nuisance = stretch
     first, end = localised_stretch(trace, counts, trace, nuisance, Settings())
     assert first <= 400
@@ -104,6 +104,6 @@ def test_parameters_of_the_simulation_are_projected_out(stretch):
     assert localised_stretch(offset, counts, offset, nuisance[..., :0], Settings()) is None
 
 
-def test_an_anticorrelated_trace_is_no_evidence(stretch):
+def test_an_anticorrelated_trace_has_no_stretch(stretch):
     trace, counts, nuisance = stretch
     assert localised_stretch(-trace, counts, trace, nuisance, Settings()) is None

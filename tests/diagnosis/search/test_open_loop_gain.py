@@ -1,4 +1,4 @@
-"""A candidate without any gain in open loop gives way to a rival that clearly improves the open loop."""
+"""A rival that clearly improves the open loop replaces a candidate without an open-loop gain."""
 
 import dataclasses
 import functools
@@ -21,65 +21,68 @@ AHEAD = 20.0
 
 
 @functools.cache
-def free():
+def fit_without_drag():
     return free_fit(DRAG)
 
 
 @functools.cache
 def with_effect(name):
     """Return the number and the joint fit of an effect."""
-    terms = all_terms(free())
+    terms = all_terms(fit_without_drag())
     number = next(n for n, term in enumerate(terms) if term.effect.id == name)
-    model = free().model.with_term(terms[number])
-    start = torch.cat([free().parameters, torch.zeros(model.size - free().model.size).double()])
-    return number, fitted_with_effect(free(), model, start, graduate=False)
+    model = fit_without_drag().model.with_term(terms[number])
+    start = torch.cat([fit_without_drag().parameters, torch.zeros(model.size - fit_without_drag().model.size).double()])
+    return number, fitted_with_effect(fit_without_drag(), model, start, graduate=False)
 
 
-def leading(first, second):
+def leader_and_ranking(first, second):
     """Return the result for two effects of this order."""
-    terms = all_terms(free())
+    terms = all_terms(fit_without_drag())
     (one, leader), (two, rival) = with_effect(first), with_effect(second)
     ranking = (Ranked(one, 50.0, 0.0), Ranked(two, 30.0, AHEAD))
-    best, moved = with_open_loop_gain(leader, ranking, [leader, rival], free(), {}, terms)
+    best, moved = with_open_loop_gain(leader, ranking, [leader, rival], fit_without_drag(), {}, terms)
     return best.model.terms[-1].effect.id, [(terms[place.number].effect.id, place.gap) for place in moved]
 
 
-def test_drag_goes_before_a_delay_that_explains_nothing():
-    name, ranking = leading("input_saturation", "quadratic_drag")
+def test_drag_replaces_a_saturation_without_an_open_loop_gain():
+    name, ranking = leader_and_ranking("input_saturation", "quadratic_drag")
     assert name == "quadratic_drag"
     assert ranking[0] == ("quadratic_drag", 0.0)
     assert ranking[1] == ("input_saturation", AHEAD)
 
 
 def test_a_candidate_that_improves_the_open_loop_stays_first():
-    name, ranking = leading("quadratic_drag", "input_saturation")
+    name, ranking = leader_and_ranking("quadratic_drag", "input_saturation")
     assert name == "quadratic_drag"
     assert ranking == [("quadratic_drag", 0.0), ("input_saturation", AHEAD)]
 
 
 def test_without_a_better_rival_the_most_likely_candidate_stays():
-    name, ranking = leading("input_saturation", "dead_zone")
+    name, ranking = leader_and_ranking("input_saturation", "dead_zone")
     assert name == "input_saturation"
     assert [gap for _, gap in ranking] == [0.0, AHEAD]
 
 
 def test_an_effect_that_halves_the_open_loop_residual_is_needed():
     drag, none = with_effect("quadratic_drag")[1], with_effect("input_saturation")[1]
-    assert float(drag.residual.std()) < 0.3 * float(free().residual.std())
-    assert float(none.residual.std()) == pytest.approx(float(free().residual.std()), rel=0.05)
-    assert improves_open_loop(drag, free())
-    assert not improves_open_loop(none, free())
+    assert float(drag.residual.std()) < 0.3 * float(fit_without_drag().residual.std())
+    assert float(none.residual.std()) == pytest.approx(float(fit_without_drag().residual.std()), rel=0.05)
+    assert improves_open_loop(drag, fit_without_drag())
+    assert not improves_open_loop(none, fit_without_drag())
 
 
 @pytest.mark.parametrize(("ratio", "larger"), [(0.98 * LARGER, False), (1.02 * LARGER, True)])
 def test_a_stretch_that_a_fit_rejects_counts_in_the_open_loop_residual(ratio, larger):
     """The middle half of the residual, and so its robust size, is smaller; a stretch of a tenth of it grows."""
-    residual = free().residual - free().residual.mean()
+    residual = fit_without_drag().residual - fit_without_drag().residual.mean()
     moved, N = residual.clone(), len(residual)
     moved[: N // 2] *= 0.5
     wanted = ratio**2 * residual.square().sum() - moved[: -N // 10].square().sum()
     moved[-N // 10 :] = (wanted / len(moved[-N // 10 :])).sqrt()
     assert (
-        enlarges_open_loop(dataclasses.replace(free(), residual=moved), dataclasses.replace(free(), residual=residual))
+        enlarges_open_loop(
+            dataclasses.replace(fit_without_drag(), residual=moved),
+            dataclasses.replace(fit_without_drag(), residual=residual),
+        )
         is larger
     )

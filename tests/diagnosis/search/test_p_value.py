@@ -23,12 +23,12 @@ def gains(ratio):
 
 
 @pytest.fixture(autouse=True)
-def alike(monkeypatch):
+def _zero_own_spectrum_gains(monkeypatch):
     """Replace the own-spectrum gains by zeros."""
     monkeypatch.setattr(module, "own_spectrum_gains", lambda _search, series, _possible: torch.zeros(series.shape[1]))
 
 
-def judged(own, tried, possible=None, *, gain=0.0, drifting=None):
+def p_value_of(own, tried, possible=None, *, gain=0.0, drifting=None):
     drawn = torch.distributions.Chi2(torch.tensor(3.0).double())
     torch.manual_seed(0)
     noise = drawn.sample((2, DRAWS))
@@ -45,27 +45,27 @@ def judged(own, tried, possible=None, *, gain=0.0, drifting=None):
 
 
 def test_a_gain_beyond_all_surrogates_has_the_smallest_p_value():
-    p_value, beyond = judged((100.0, 1.0), tried=2)
+    p_value, beyond = p_value_of((100.0, 1.0), tried=2)
     assert p_value == pytest.approx(1.0 / (1 + DRAWS))
     assert beyond > 10.0
 
 
 def test_a_size_of_an_impossible_sign_does_not_count():
-    assert judged((100.0, 1.0), 2, possible=(False, True))[0] > 0.3
-    assert judged((100.0, 1.0), 2, possible=(False, False))[0] == 1.0
+    assert p_value_of((100.0, 1.0), 2, possible=(False, True))[0] > 0.3
+    assert p_value_of((100.0, 1.0), 2, possible=(False, False))[0] == 1.0
 
 
 def test_a_drift_is_drawn_only_if_it_gains_clearly():
     """Half of all white noise fits a small drift, and surrogates with it would be harder to exceed."""
     drifting = torch.full((2, DRAWS), 50.0, dtype=torch.float64)
-    without, _ = judged((20.0, 1.0), 2, gain=1.0, drifting=drifting)
+    without, _ = p_value_of((20.0, 1.0), 2, gain=1.0, drifting=drifting)
     assert without == pytest.approx(1.0 / (1 + DRAWS))
-    assert judged((20.0, 1.0), 2, gain=5.0, drifting=drifting)[0] > 0.3
+    assert p_value_of((20.0, 1.0), 2, gain=5.0, drifting=drifting)[0] > 0.3
 
 
-def test_refined_shapes_are_left_out():
-    with_it, _ = judged((1.0, 100.0), tried=2)
-    without, beyond = judged((1.0, 100.0), tried=1)
+def test_refined_shapes_do_not_enter_the_p_value():
+    with_it, _ = p_value_of((1.0, 100.0), tried=2)
+    without, beyond = p_value_of((1.0, 100.0), tried=1)
     assert with_it == pytest.approx(1.0 / (1 + DRAWS))
     assert without > 0.3
     assert beyond < 0.0
@@ -80,9 +80,9 @@ def test_own_spectrum_gains_can_lower_the_p_value(monkeypatch):
         return torch.linspace(1.0, 0.0, series.shape[1])
 
     monkeypatch.setattr(module, "own_spectrum_gains", gains_of)
-    assert judged((1.0, 1.0), 1)[0] <= 0.02
+    assert p_value_of((1.0, 1.0), 1)[0] <= 0.02
     assert masks == [[True, False]], "refined shapes are left out here too"
-    assert judged((100.0, 1.0), 2)[0] == pytest.approx(1.0 / (1 + DRAWS))
+    assert p_value_of((100.0, 1.0), 2)[0] == pytest.approx(1.0 / (1 + DRAWS))
     assert len(masks) == 1
 
 

@@ -14,38 +14,38 @@ from tests.diagnosis.search.test_free_runs import DRAG, all_terms, free_fit
 
 
 @functools.cache
-def free(drag=DRAG):
+def fit_of_drag(drag=DRAG):
     return free_fit(drag)
 
 
-def found(name, *rivals, drag=DRAG):
-    """The result of a search that found an effect, with these rivals."""
-    terms = all_terms(free(drag))
+def found_effect(name, *rivals, drag=DRAG):
+    """Return the result of a search that found an effect, with these rivals."""
+    terms = all_terms(fit_of_drag(drag))
     numbers = [next(n for n, term in enumerate(terms) if term.effect.id == each) for each in (name, *rivals)]
     term = terms[numbers[0]]
-    model = free(drag).model.with_term(term)
-    zeros = torch.zeros(model.size - free(drag).model.size).double()
-    fit = fitted_with_effect(free(drag), model, torch.cat([free(drag).parameters, zeros]), graduate=False)
+    model = fit_of_drag(drag).model.with_term(term)
+    zeros = torch.zeros(model.size - fit_of_drag(drag).model.size).double()
+    fit = fitted_with_effect(fit_of_drag(drag), model, torch.cat([fit_of_drag(drag).parameters, zeros]), graduate=False)
     ranking = tuple(Ranked(number, 10.0, float(gap)) for gap, number in enumerate(numbers))
     return types.SimpleNamespace(term=term, fit=fit, ranking=ranking, scene=types.SimpleNamespace(terms=terms))
 
 
-def test_the_size_of_an_effect_is_determined_where_the_effect_is_missing():
-    assert not is_undetermined(found("quadratic_drag").fit, NoiseSettings())
-    assert is_undetermined(found("quadratic_drag", drag=0.0).fit, NoiseSettings())
+def test_a_size_is_undetermined_if_the_recording_lacks_the_effect():
+    assert not is_undetermined(found_effect("quadratic_drag").fit, NoiseSettings())
+    assert is_undetermined(found_effect("quadratic_drag", drag=0.0).fit, NoiseSettings())
 
 
-def test_the_missing_effect_joins_the_finding():
-    pair = with_partner(found("dead_zone", "quadratic_drag"), free(), {}, Settings())
+def test_the_partner_of_a_finding_is_the_missing_effect():
+    pair = with_partner(found_effect("dead_zone", "quadratic_drag"), fit_of_drag(), {}, Settings())
     assert [term.effect.id for term in pair.model.terms] == ["dead_zone", "quadratic_drag"]
     assert float(pair.parameters[-1]) == pytest.approx(DRAG, rel=0.1)
 
 
-def test_a_partner_that_does_not_pay_is_none():
-    assert with_partner(found("dead_zone", "quadratic_drag", drag=0.0), free(0.0), {}, Settings()) is None
+def test_a_partner_without_a_gain_above_its_penalty_is_not_added():
+    assert with_partner(found_effect("dead_zone", "quadratic_drag", drag=0.0), fit_of_drag(0.0), {}, Settings()) is None
 
 
-def test_the_same_effect_elsewhere_comes_before_the_three_leading_others():
+def test_partner_candidates_are_the_same_effect_at_other_ports_and_three_leading_rivals():
     def term(name, place, curve=False):
         return types.SimpleNamespace(key=(name, place), effect=types.SimpleNamespace(id=name, is_curve=curve))
 

@@ -22,26 +22,26 @@ from tests.diagnosis.line import Line
 from tests.simulation.tumbling import tumbling
 
 N = 2000
-TIMED = tuple(effect for effect in CATALOGUE if effect.id in ("hard_iron_step", "offset_drift"))
-STEP = next(effect for effect in TIMED if effect.id == "hard_iron_step")
+STEP_AND_DRIFT_EFFECTS = tuple(effect for effect in CATALOGUE if effect.id in ("hard_iron_step", "offset_drift"))
+STEP = next(effect for effect in STEP_AND_DRIFT_EFFECTS if effect.id == "hard_iron_step")
 STEPS = tuple(Term(STEP, None, {"onset": onset}, "mixed") for onset in (0.4, 0.9, 1.3))
 
 
 @pytest.fixture(scope="module")
-def found():
-    """The search of a recording with a step of 0.7 µT, at a third of its length, between two onsets of the grid."""
+def step_search():
+    """Return the search of a recording with a step of 0.7 µT between two onsets of the grid."""
     sensor = np.zeros((N, 3))
     sensor[671:] = [0.4, -0.4, 0.4]
     prepared = Magnetometer("attitude").prepare(tumbling(N, noise=0.3, sensor=sensor, attitude=True, gyro=True))
     base = fitted(JointModel(prepared), prepared.start())
-    terms = candidate_terms(prepared, (), TIMED)
+    terms = candidate_terms(prepared, (), STEP_AND_DRIFT_EFFECTS)
     generator = torch.Generator().manual_seed(0)
     return prepared, terms, run_search(base, terms, level=0.05, surrogates=19, generator=generator, settings=Settings())
 
 
 @pytest.mark.e2e
-def test_the_best_candidate_has_a_shape_between_grid_points(found):
-    prepared, terms, located = found
+def test_the_best_candidate_has_a_shape_between_grid_points(step_search):
+    prepared, terms, located = step_search
     first = located.scene.terms[located.ranking[0].number]
     assert first.effect.id == located.term.effect.id == "hard_iron_step"
     assert first not in terms
@@ -50,8 +50,8 @@ def test_the_best_candidate_has_a_shape_between_grid_points(found):
 
 
 @pytest.mark.e2e
-def test_its_gain_is_the_largest_of_all_shapes(found):
-    _, _, located = found
+def test_the_best_candidate_has_the_largest_gain_of_all_shapes(step_search):
+    _, _, located = step_search
     gains = located.look.gains.ratio[:, 0]
     steps = [k for k, term in enumerate(located.scene.terms) if term.effect.id == "hard_iron_step"]
     assert float(gains[located.ranking[0].number]) == pytest.approx(float(gains[steps].max()))
@@ -145,7 +145,7 @@ class Driven(Line):
         (Line(), [4.1, 0.4], 0),  # the simulation has no initial values of a user
     ],
 )
-def test_initial_values_are_a_start_if_a_parameter_moved_far(line, now, starts):
+def test_initial_values_are_a_start_if_a_parameter_is_far_from_them(line, now, starts):
     fit = fitted(JointModel(line), line.start())
     found = _first_start(dataclasses.replace(fit, parameters=torch.tensor(now, dtype=torch.float64)), 5.0)
     assert len(found) == starts

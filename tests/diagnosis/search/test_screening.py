@@ -34,7 +34,7 @@ def recording(*effects, seed=0):
 
 
 def located(*effects, seed=0):
-    """The result of the first search."""
+    """Return the result of the first search."""
     simulation = Magnetometer("attitude")
     prepared = simulation.prepare(recording(*effects, seed=seed))
     roles = frozenset(role for effect in CATALOGUE for role in effect.roles)

@@ -37,7 +37,7 @@ class GivenStep(Drive):
 
 @pytest.fixture(scope="module")
 def recording():
-    """A recording of a motor whose load is on a flexible shaft, integrated at 1/60 of the sampling interval."""
+    """Return a recording of a motor whose load is on a flexible shaft, integrated at 1/60 of the sampling interval."""
     generator = torch.Generator().manual_seed(1)
     torque = 0.2 * torch.randn(SAMPLES, generator=generator, dtype=torch.float64)
     omega, h = 2.0 * math.pi / PERIOD, STEP / PARTS

@@ -20,7 +20,7 @@ def randn(*size, seed):
 
 
 def smooth(seed):
-    """A random course of twelve slow cosines, with mean square 1."""
+    """Return a random course of twelve slow cosines, with mean square 1."""
     power = torch.zeros(N).double()
     power[1:13] = 1.0
     course = randn(N, M, seed=seed) * power.unsqueeze(-1)
@@ -49,7 +49,7 @@ def linearised_at(size, seed=3):
     )
 
 
-BOTH = torch.ones(2, dtype=torch.bool)
+BOTH_POSSIBLE = torch.ones(2, dtype=torch.bool)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -58,7 +58,7 @@ def test_a_slow_effect_gains_more_with_its_own_spectrum(seed):
     drawn = linearised.search.white(400, torch.Generator().manual_seed(4))
     series = torch.cat([linearised.series.unsqueeze(-1), drawn], -1)
     by_search = 0.5 * linearised.search.gains(series).ratio.amax(0) - 1.0
-    by_own_spectrum = own_spectrum_gains(linearised, series, BOTH)
+    by_own_spectrum = own_spectrum_gains(linearised, series, BOTH_POSSIBLE)
     assert float(by_own_spectrum[0]) > 1.5 * float(by_search[0])
     assert float(by_own_spectrum[0]) > float(by_own_spectrum[1:].max()) + 5.0
     assert float(by_own_spectrum[1:].median()) < 3.0
@@ -74,22 +74,22 @@ def test_the_gain_is_the_ratio_of_whittle_likelihoods():
     both = [
         sum(whittle(series.square()[:, j : j + 1]) for j in range(M)) for series in (values - size * columns, values)
     ]
-    found = own_spectrum_gains(linearised, linearised.series.unsqueeze(-1), BOTH)
+    found = own_spectrum_gains(linearised, linearised.series.unsqueeze(-1), BOTH_POSSIBLE)
     assert float(found) == pytest.approx(float(both[0] - both[1]) - 1.0, rel=1e-9)
     assert float(found) > 10.0
 
 
-def test_impossible_candidates_do_not_count():
+def test_impossible_candidates_have_no_gain():
     linearised = linearised_at(0.5)
     found = own_spectrum_gains(linearised, linearised.series.unsqueeze(-1), torch.tensor([True, False]))
     assert float(found) < 3.0
 
 
-def test_units_of_the_channels_do_not_matter(monkeypatch):
+def test_gains_do_not_depend_on_units_of_the_channels(monkeypatch):
     first = linearised_at(0.3)
     monkeypatch.setattr(sys.modules[__name__], "SCALE", torch.tensor([1e6, 1e-6]).double())
     other = linearised_at(0.3)
-    gains = [own_spectrum_gains(search, search.series.unsqueeze(-1), BOTH) for search in (first, other)]
+    gains = [own_spectrum_gains(search, search.series.unsqueeze(-1), BOTH_POSSIBLE) for search in (first, other)]
     torch.testing.assert_close(*gains)
 
 

@@ -1,4 +1,4 @@
-"""The search with process noise: the missing effect is named in a fit under its own remaining process noise."""
+"""The search with process noise: each leading candidate is fitted under its own process noise."""
 
 import dataclasses
 import importlib
@@ -20,11 +20,11 @@ from mkc_torch.diagnosis.search.with_process_noise import (
 from mkc_torch.diagnosis.settings import SearchSettings, Settings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.nonlinear import NoFitError
-from tests.diagnosis.swing import Pendulum, at_the_truth, candidates, fitted_swing, swung
+from tests.diagnosis.swing import Pendulum, candidates, fitted_pendulum, pendulum_at_truth, pendulum_recording
 
-of_diagnosis = importlib.import_module("mkc_torch.diagnosis.diagnose")
-of_search = importlib.import_module("mkc_torch.diagnosis.pipeline.search")
-FEW = Settings(search=dataclasses.replace(SearchSettings(), own_noise=2))
+diagnose_module = importlib.import_module("mkc_torch.diagnosis.diagnose")
+search_module = importlib.import_module("mkc_torch.diagnosis.pipeline.search")
+FEW_REFITS = Settings(search=dataclasses.replace(SearchSettings(), own_noise=2))
 
 
 def located(fit, draws=39, level=0.05):
@@ -36,13 +36,13 @@ def located(fit, draws=39, level=0.05):
         generator=torch.Generator().manual_seed(0),
         declared={},
         fixed={},
-        settings=FEW,
+        settings=FEW_REFITS,
     )
 
 
 @pytest.mark.e2e
 def test_hidden_drag_is_named_and_sized_under_process_noise():
-    base = fitted_swing("slow", drag=0.4).fit
+    base = fitted_pendulum("slow", drag=0.4).fit
     terms, found = candidates(base, DYNAMICS), located(base)
     assert found.p_value == pytest.approx(1.0 / 40.0)
     assert (found.term.effect.id, found.term.port) == ("quadratic_drag", "rate of rate")
@@ -64,7 +64,7 @@ def test_hidden_drag_is_named_and_sized_under_process_noise():
 
 @pytest.mark.parametrize("seed", [2])
 def test_process_noise_alone_gives_no_finding(seed):
-    found = located(at_the_truth("white", seed))
+    found = located(pendulum_at_truth("white", seed))
     assert found.p_value > 0.05
     assert found.compared == ()
 
@@ -72,7 +72,7 @@ def test_process_noise_alone_gives_no_finding(seed):
 def test_a_diverging_trajectory_raises(monkeypatch):
     monkeypatch.setattr("mkc_torch.diagnosis.search.with_process_noise.joint_likelihood", lambda *_, **__: None)
     with pytest.raises(NoFitError, match="no finite trajectory"):
-        located(at_the_truth("white", 1))
+        located(pendulum_at_truth("white", 1))
 
 
 def test_candidates_far_behind_are_not_refitted():
@@ -84,8 +84,10 @@ def test_candidates_far_behind_are_not_refitted():
 
 @pytest.mark.e2e
 def test_candidates_without_a_refit_stay_in_the_ranking():
-    base = fitted_swing("slow", drag=0.4).fit
-    strict = dataclasses.replace(FEW, search=dataclasses.replace(FEW.search, behind=0.0, behind_share=0.0))
+    base = fitted_pendulum("slow", drag=0.4).fit
+    strict = dataclasses.replace(
+        FEW_REFITS, search=dataclasses.replace(FEW_REFITS.search, behind=0.0, behind_share=0.0)
+    )
     found = search_with_process_noise(
         base, candidates(base, DYNAMICS), level=0.05, surrogates=39, generator=torch.Generator().manual_seed(0),
         declared={}, fixed={}, settings=strict,
@@ -95,8 +97,8 @@ def test_candidates_without_a_refit_stay_in_the_ranking():
     assert found.ranking[0].gap == 0.0 <= min(rival.gap for rival in found.ranking[1:])
 
 
-def test_a_candidate_that_missed_the_noise_is_fitted_from_the_noise_of_the_simulation_alone():
-    base, settings = fitted_swing("slow", drag=0.0).fit, Settings()
+def test_a_candidate_less_likely_than_the_baseline_is_refitted_from_the_noise_of_the_baseline():
+    base, settings = fitted_pendulum("slow", drag=0.0).fit, Settings()
     drag = next(term for term in candidates(base, DYNAMICS) if term.effect.id == "quadratic_drag")
     model = JointModel(base.model.prepared.open_loop(), (drag,), base.model.near)
     missed = fitted(model, torch.cat([base.parameters, torch.zeros(1).double()]))
@@ -109,7 +111,7 @@ def test_a_candidate_that_missed_the_noise_is_fitted_from_the_noise_of_the_simul
 
 
 def of_likelihood(value, size, shape=()):
-    """A stub of an open-loop fit of 400 samples, with the fields that penalties need."""
+    """Return a stub of an open-loop fit of 400 samples, with the fields that penalties need."""
     effect = types.SimpleNamespace(fitted_shape=shape)
     term = types.SimpleNamespace(effect=effect, key=("drag", (), "rate"))
     model = types.SimpleNamespace(size=size, sizes=[1], terms=[term], prepared=types.SimpleNamespace(observer=None))
@@ -120,7 +122,7 @@ def test_an_effect_that_gains_less_than_its_penalty_is_needless():
     bare = of_likelihood(1000.0, 3)
     # two numbers: six nats by Schwarz, two by Akaike where the draws were of that noise
     for gain, drawn, needless in ((5.9, False, True), (6.1, False, False), (1.9, True, True), (2.1, True, False)):
-        assert _needless(of_likelihood(1000.0 + gain, 4, ("period",)), bare, FEW, drawn=drawn) is needless
+        assert _needless(of_likelihood(1000.0 + gain, 4, ("period",)), bare, FEW_REFITS, drawn=drawn) is needless
 
 
 @pytest.mark.parametrize(("bare", "counts"), [(1000.0, True), (1095.0, False), (None, False)])
@@ -132,13 +134,13 @@ def test_without_surrogates_the_gain_must_hold_under_the_noise_found_with_the_ef
     monkeypatch.setattr(f"{module}.run_parallel", lambda works, *_: [work() for work in works])
     monkeypatch.setattr(f"{module}.priced", lambda fit, _: fit.value)
     monkeypatch.setattr(f"{module}._without", lambda *_: None if bare is None else of_likelihood(bare, 3))
-    assert _plain(base, [run], run.model.terms, {}, FEW) is counts
+    assert _plain(base, [run], run.model.terms, {}, FEW_REFITS) is counts
 
 
 @pytest.mark.parametrize(
     ("led_to", "again", "counts"), [(1000.0, 1000.0, True), (1095.0, 1000.0, False), (1000.0, 1095.0, False)]
 )
-def test_without_surrogates_the_simulation_alone_has_the_best_noise_of_any_candidate_selected_again(
+def test_without_surrogates_the_baseline_has_the_best_reselected_noise_of_any_candidate(
     led_to, again, counts, monkeypatch
 ):
     base, run, other = of_likelihood(1000.0, 3), of_likelihood(1100.0, 4), of_likelihood(1001.0, 4)
@@ -149,12 +151,12 @@ def test_without_surrogates_the_simulation_alone_has_the_best_noise_of_any_candi
     monkeypatch.setattr(f"{module}.run_parallel", lambda works, *_: [work() for work in works])
     monkeypatch.setattr(f"{module}.priced", lambda fit, _: fit.value)
     monkeypatch.setattr(f"{module}._without", lambda _, fit, *__: bare if fit is run else of_likelihood(led_to, 3))
-    assert _plain(base, [run, other], run.model.terms, {}, FEW) is counts
+    assert _plain(base, [run, other], run.model.terms, {}, FEW_REFITS) is counts
 
 
 @pytest.mark.e2e
 def test_the_search_is_repeated_under_a_more_likely_noise(monkeypatch):
-    bases, original = [], of_search.first_step
+    bases, original = [], search_module.first_step
 
     def first_step(base, terms, *rest):
         bases.append(base)
@@ -162,9 +164,11 @@ def test_the_search_is_repeated_under_a_more_likely_noise(monkeypatch):
         better = dataclasses.replace(base) if len(bases) == 1 else None
         return dataclasses.replace(found, first=dataclasses.replace(found.first, without_candidate=better))
 
-    monkeypatch.setattr(of_search, "first_step", first_step)
+    monkeypatch.setattr(search_module, "first_step", first_step)
     messages = []
-    found = of_diagnosis.diagnose(Pendulum(), swung("white", 2, 200)[0], surrogates=19, progress=messages.append)
+    found = diagnose_module.diagnose(
+        Pendulum(), pendulum_recording("white", 2, 200)[0], surrogates=19, progress=messages.append
+    )
     assert sum("more likely noise" in line for line in messages) == 1
     assert len(bases) == 2
     assert bases[1] is not bases[0]

@@ -32,7 +32,7 @@ N = 80
 
 
 EFFECTS = pytest.mark.parametrize("effect", DYNAMICS, ids=lambda e: e.id)
-OF = {effect.id: effect for effect in DYNAMICS}
+EFFECT_BY_ID = {effect.id: effect for effect in DYNAMICS}
 
 
 def change(effect, gamma, shape, context):
@@ -41,7 +41,7 @@ def change(effect, gamma, shape, context):
 
 @pytest.mark.parametrize("name", LOSSES)
 def test_losses_dissipate_energy(name):
-    effect, context = OF[name], dynamic_context(OF[name])
+    effect, context = EFFECT_BY_ID[name], dynamic_context(EFFECT_BY_ID[name])
     for shape in effect.shapes(context.time):
         for gamma in torch.eye(size_of(effect, shape, context), dtype=torch.float64):
             power = effect.change(gamma, shape, context)[:, 0] * context.part("own")
@@ -72,23 +72,23 @@ class TestPhysics:
 
     @staticmethod
     def at(name, gamma, shape=None, **values):
-        effect = OF[name]
+        effect = EFFECT_BY_ID[name]
         context = dynamic_context(effect)
         carried = context.carries or context.channels
         row = torch.tensor([values.get(name, 0.0) for name in carried], dtype=torch.float64)
         return change(effect, gamma, shape or {}, replace(context, signal=row.expand(N, -1)))[0].tolist()
 
-    def test_constant_force(self):
+    def test_a_constant_force_is_its_amplitude(self):
         assert self.at("constant_force", [0.3], speed=-5.0) == [0.3]
 
     @pytest.mark.parametrize("sign", [1.0, -1.0])
-    def test_drags(self, sign):
+    def test_drags_oppose_the_speed_by_its_power(self, sign):
         assert self.at("linear_drag", [0.3], speed=2.0 * sign) == pytest.approx([-0.6 * sign])
         assert self.at("quadratic_drag", [0.3], speed=2.0 * sign) == pytest.approx([-1.2 * sign])
         assert self.at("cubic_stiffness", [0.3], angle=2.0 * sign) == pytest.approx([-2.4 * sign])
 
     @pytest.mark.parametrize("sign", [1.0, -1.0])
-    def test_friction_has_constant_size(self, sign):
+    def test_friction_opposes_the_speed_independently_of_its_size(self, sign):
         for speed in (0.1, 10.0):
             braked = self.at("coulomb_friction", [0.3], {"width": 0.01}, speed=speed * sign)
             assert braked == pytest.approx([-0.3 * sign])
@@ -99,7 +99,7 @@ class TestPhysics:
         loaded = self.at("load_dependent_friction", [0.3, 0.1], {"width": 0.01}, speed=sign, load=5.0)
         assert loaded == pytest.approx([-0.8 * sign])
 
-    def test_a_periodic_force(self):
+    def test_a_position_periodic_force_is_a_sum_of_harmonics(self):
         force = self.at("position_periodic_force", [0.3, 0.2], {"order": 4.0}, angle=0.5)
         assert force == pytest.approx([0.3 * math.sin(2.0) + 0.2 * math.cos(2.0)])
 
@@ -116,7 +116,7 @@ class TestPhysics:
     def test_integer_powers_equal_drags_and_springs(self, sign):
         """γ is the size at the scale; below a thousandth of the scale the curve is linear."""
         of = {(e.id, e.plot_axis, "surroundings" in e.needs): e for e in DYNAMICS}
-        context = dynamic_context(OF["power_law"])
+        context = dynamic_context(EFFECT_BY_ID["power_law"])
         speed, angle, wind = (sign * context.component(name) for name in ("speed", "angle", "other"))
         context = replace(context, signal=sign * context.signal)
         for key, scale, exponent, expected in (
@@ -128,10 +128,13 @@ class TestPhysics:
             found = change(of[key], [0.3 * 5.0**exponent], {scale: 5.0, "exponent": exponent}, context)[:, 0]
             exact = exponent == 1.0
             torch.testing.assert_close(found, 0.3 * expected, rtol=0.0, atol=1e-12 if exact else 1e-4)
-        named = {e.id: change(e, [0.3], {}, context)[:, 0] for e in (OF["linear_drag"], OF["quadratic_drag"])}
+        named = {
+            e.id: change(e, [0.3], {}, context)[:, 0]
+            for e in (EFFECT_BY_ID["linear_drag"], EFFECT_BY_ID["quadratic_drag"])
+        }
         for name, exponent in (("linear_drag", 1.0), ("quadratic_drag", 2.0)):
             shape = {"scale_of_own": 5.0, "exponent": exponent}
-            found = change(OF["power_law"], [0.3 * 5.0**exponent], shape, context)[:, 0]
+            found = change(EFFECT_BY_ID["power_law"], [0.3 * 5.0**exponent], shape, context)[:, 0]
             torch.testing.assert_close(found, named[name], rtol=0.0, atol=1e-4)
 
     def test_losses_to_surroundings_vanish_at_equality(self):
@@ -157,15 +160,15 @@ class TestPhysics:
         found = change(effect, [2.0, 0.4], shape, replace(context, signal=row.expand(N, -1)))
         assert found[0].tolist() == pytest.approx([-0.5, 0.1])
 
-    def test_exponents_of_overflow_and_stops(self):
+    def test_overflow_and_stops_are_powers_of_the_excess(self):
         for lost, exponent in ((0.5, 1.0), (0.5**1.5, 1.5), (0.5**2.5, 2.5)):
             shape = {"rim": 1.0, "exponent": exponent}
             assert self.at("overflow", [2.0], shape, speed=1.5) == pytest.approx([-2.0 * lost])
             shape = {"place": 1.0, "exponent": exponent}
             assert self.at("hard_stop", [2.0, 4.0], shape, angle=-1.5) == pytest.approx([4.0 * lost])
 
-    def test_radiation_in_both_units(self):
-        effect = OF["thermal_loss"]
+    def test_radiation_in_kelvin_or_celsius_is_a_linear_loss_near_room_temperature(self):
+        effect = EFFECT_BY_ID["thermal_loss"]
         for unit, room in (("°C", 20.0), ("K", 293.15)):
             context = replace(dynamic_context(effect), part_units={"own": unit})
             hot = context.signal.new_tensor([0.0, room, 0.0, 0.0, 0.0]).expand(N, -1)
@@ -174,7 +177,7 @@ class TestPhysics:
             lost = float(change(effect, [1.0], {}, replace(context, signal=hot))[0])
             assert lost == pytest.approx(-0.01, rel=1e-3)
 
-    def test_saturation_and_dead_zone(self):
+    def test_saturation_clips_and_a_dead_zone_shifts_the_input(self):
         limit, width = {"limit": 1.0, "softness": 0.01}, {"width": 1.0, "softness": 0.01}
         for u, limited, dead in ((3.0, 1.0, 2.0), (-3.0, -1.0, -2.0), (0.5, 0.5, 0.0)):
             assert u + self.at("input_saturation", [1.0], limit, force=u)[0] == pytest.approx(limited)
@@ -182,7 +185,7 @@ class TestPhysics:
 
 
 def test_a_delay_interpolates_between_samples():
-    effect = OF["input_delay"]
+    effect = EFFECT_BY_ID["input_delay"]
     context = dynamic_context(effect)
     course = (3.0 * context.time + 1.0).unsqueeze(-1)
     for delay in (0.003, 0.1, 0.57):
@@ -193,7 +196,7 @@ def test_a_delay_interpolates_between_samples():
 
 def test_a_delay_does_not_reach_into_another_run():
     """A run begins where time goes back, in steady state at its first value."""
-    effect = OF["input_delay"]
+    effect = EFFECT_BY_ID["input_delay"]
     time = torch.cat([torch.linspace(0.0, 2.0, 40), torch.linspace(0.0, 1.0, 40)]).double()
     course = torch.cat([7.0 + 0.0 * time[:40], 1.0 + time[40:]]).unsqueeze(-1)
     context = replace(dynamic_context(effect), time=time, signal=course)
@@ -205,7 +208,7 @@ def test_a_delay_does_not_reach_into_another_run():
 @pytest.mark.parametrize("name", ["input_delay", "input_lag", "sensor_lag", "backlash"])
 def test_runs_are_separated_by_their_number_for_any_clock(name):
     """On a common clock, and on separate clocks, the memory of a run ends with the run."""
-    effect = OF[name]
+    effect = EFFECT_BY_ID[name]
     first, second = torch.linspace(0.0, 2.0, 40).double(), torch.linspace(2.1, 3.9, 40).double()
     course = torch.cat([7.0 + torch.sin(5.0 * first), torch.cos(5.0 * second)]).unsqueeze(-1)
     run = torch.arange(2).repeat_interleave(40)
@@ -219,7 +222,7 @@ def test_runs_are_separated_by_their_number_for_any_clock(name):
 
 
 def test_an_actuator_lags_by_its_time_constant():
-    effect = OF["input_lag"]
+    effect = EFFECT_BY_ID["input_lag"]
     time = torch.linspace(0.0, 5.0, N, dtype=torch.float64)
     ramp = 3.0 * time.unsqueeze(-1)
     context = replace(dynamic_context(effect), time=time, signal=ramp)
@@ -230,7 +233,7 @@ def test_an_actuator_lags_by_its_time_constant():
 
 
 def test_square_input_equals_the_largest_input_and_a_quarter_at_half():
-    effect = OF["input_square"]
+    effect = EFFECT_BY_ID["input_square"]
     context = dynamic_context(effect)
     signal = torch.linspace(-4.0, 4.0, 5, dtype=torch.float64).unsqueeze(-1)
     context = replace(context, time=context.time[:5], drivers=context.drivers[:5], signal=signal)
@@ -240,7 +243,7 @@ def test_square_input_equals_the_largest_input_and_a_quarter_at_half():
 
 
 def test_a_sensor_lags_by_its_time_constant():
-    effect = OF["sensor_lag"]
+    effect = EFFECT_BY_ID["sensor_lag"]
     time = torch.linspace(0.0, 5.0, N, dtype=torch.float64)
     ramp = 3.0 * time.unsqueeze(-1)
     context = replace(dynamic_context(effect), time=time, signal=ramp)
@@ -259,8 +262,8 @@ def test_a_sensor_lags_by_its_time_constant():
         ("sensor_lag", [""]),
     ],
 )
-def test_units_of_amplitudes(name, units):
-    effect = OF[name]
+def test_amplitudes_have_the_units_of_their_formulas(name, units):
+    effect = EFFECT_BY_ID[name]
     context = replace(dynamic_context(effect), signal_unit="m/s²")
     shape = effect.shapes(context.time)[0]
     assert [quantity.unit for quantity in effect.quantities(shape, context)] == units
@@ -317,8 +320,8 @@ def prepared(system, **columns):
     return system().prepare(Recording({"time": TIME, **columns}))
 
 
-def tried(simulation):
-    """Port to ids of effects."""
+def effects_by_port(simulation):
+    """Return the ids of the tried effects by port."""
     places = {}
     for term in candidate_terms(simulation, (), DYNAMICS):
         places.setdefault(term.port, set()).add(term.effect.id)
@@ -330,11 +333,11 @@ REVERSING = {"coulomb_friction", "stribeck_friction"}
 
 
 class TestNeeds:
-    """Effects are tried only where they have a meaning."""
+    """Effects are tried only at ports that have the parts which they need."""
 
     @pytest.mark.e2e
-    def test_of_a_pendulum(self):
-        places = tried(prepared(Pendulum, angle=torch.cos(3.0 * TIME)))
+    def test_effects_tried_on_a_pendulum(self):
+        places = effects_by_port(prepared(Pendulum, angle=torch.cos(3.0 * TIME)))
         of_speed = EVERYWHERE | REVERSING | {"cubic_stiffness", "hard_stop", "position_periodic_force", "added_mass"}
         remembering = {"hysteretic rate of speed", "lagged rate of speed", "resonant rate of speed"}
         assert set(places) == {"rate of speed", "output", *remembering}
@@ -344,20 +347,20 @@ class TestNeeds:
         assert places["rate of speed"] & set(IDS) == of_speed
         assert places["output"] == {"sensor_lag"}
 
-    def test_of_a_drive(self):
-        places = tried(prepared(Motor, angle=torch.cos(3.0 * TIME), torque=torch.sin(TIME)))
+    def test_effects_tried_on_a_motor_with_an_input(self):
+        places = effects_by_port(prepared(Motor, angle=torch.cos(3.0 * TIME), torque=torch.sin(TIME)))
         assert "load_dependent_friction" in set().union(*places.values())
         assert places["input torque"] == {
             "input_delay", "input_lag", "input_square", "input_saturation", "dead_zone", "backlash",
         }  # fmt: skip
 
-    def test_of_a_fall_that_does_not_reverse(self):
-        places = tried(prepared(Fall, height=100.0 - 0.5 * TIME**2))
+    def test_friction_and_hysteresis_are_not_tried_on_a_fall_without_reversal(self):
+        places = effects_by_port(prepared(Fall, height=100.0 - 0.5 * TIME**2))
         assert places["rate of speed"] & set(IDS) == EVERYWHERE | {"hard_stop", "added_mass"}
         assert "hysteretic rate of speed" not in places
 
     def test_buoyancy_needs_a_height(self):
-        assert "buoyancy" in tried(prepared(Fall, height=torch.cos(TIME)))["rate of speed"]
+        assert "buoyancy" in effects_by_port(prepared(Fall, height=torch.cos(TIME)))["rate of speed"]
 
         class Sway(Fall):
             states = ("sway", "speed")
@@ -366,12 +369,12 @@ class TestNeeds:
             def derivative(self, time, x, u, p):
                 return {"sway": x.speed, "speed": -9.81 + 0.0 * x.speed}
 
-        places = tried(prepared(Sway, sway=torch.cos(TIME)))
+        places = effects_by_port(prepared(Sway, sway=torch.cos(TIME)))
         assert "buoyancy" not in places["rate of speed"]
 
-    def test_of_a_ball_that_may_spin(self):
+    def test_magnus_lift_is_tried_with_and_without_a_recorded_spin(self):
         fall = {"x": 20.0 * TIME, "y": 9.0 * TIME - 4.9 * TIME**2}
-        assert tried(prepared(Ball, **fall))["exchange of vx and vy"] == {"coupling", "magnus_lift"}
+        assert effects_by_port(prepared(Ball, **fall))["exchange of vx and vy"] == {"coupling", "magnus_lift"}
         simulation = prepared(Ball, **fall, spin_z=50.0 - TIME)
         roles = frozenset(role for effect in DYNAMICS for role in effect.roles)
         drivers = find_drivers(simulation.recording, simulation.system.columns, DriverSettings(), roles)
@@ -382,9 +385,9 @@ class TestNeeds:
         class Joints(Ball):
             units = {"x": "rad", "y": "rad", "vx": "rad/s", "vy": "rad/s"}
 
-        assert tried(prepared(Joints, x=TIME, y=TIME))["exchange of vx and vy"] == {"coupling"}
+        assert effects_by_port(prepared(Joints, x=TIME, y=TIME))["exchange of vx and vy"] == {"coupling"}
 
-    def test_losses_to_surroundings_are_tried_where_they_are_known(self):
+    def test_losses_to_surroundings_are_tried_where_the_surroundings_are_an_input(self):
         class Room(Dynamics):
             states, inputs = ("inner", "wall"), ("power", "outside")
             parameters = {"loss": 0.1}
@@ -418,9 +421,9 @@ class TestNeeds:
 
         assert set(prepared(Pieces, angle=torch.cos(3.0 * TIME)).ports) == {"rate of speed", "output"}
 
-    def test_of_two_bodies(self):
+    def test_effects_tried_on_two_bodies_are_thermal(self):
         decay = torch.exp(-0.1 * TIME)
-        places = tried(prepared(Bodies, inner=20.0 + 60.0 * decay, outer=20.0 + 20.0 * decay))
+        places = effects_by_port(prepared(Bodies, inner=20.0 + 60.0 * decay, outer=20.0 + 20.0 * decay))
         assert places["exchange of inner and outer"] == {"coupling"}
         # heat can be stored elsewhere, and has no inertia
         assert places["lagged rate of inner"] == {"hidden_lag"}

@@ -10,7 +10,7 @@ from mkc_torch.effects.context import Context
 from mkc_torch.effects.dynamics.linear_drag import LinearDrag
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 from mkc_torch.effects.dynamics.unknown_rate import DEGREE, UnknownRate
-from tests.diagnosis.test_dynamics_diagnosis import NOISE, Pendulum, swung
+from tests.diagnosis.test_dynamics_diagnosis import NOISE, Pendulum, pendulum_recording
 
 REACH = 1.5
 GAMMA = torch.tensor([0.3, -0.7, 0.2, 0.5], dtype=torch.float64)
@@ -27,7 +27,7 @@ def context():
     return Context(angle, angle.new_zeros(41, 0), (), signal, "rad/s²", ("speed",), names, parts, {"position": "rad"})
 
 
-def along(context, of):
+def argument_of_curve(context, of):
     return context.part("own") - context.part("surroundings") if of == "difference" else context.part(of)
 
 
@@ -35,7 +35,7 @@ def along(context, of):
 def test_curve_is_a_legendre_series_and_constant_beyond_its_reach(context, of):
     effect = UnknownRate(of)
     found = effect.change(GAMMA, {f"reach_of_{of}": REACH}, context)[:, 0]
-    inside = np.clip(along(context, of).numpy() / REACH, -1.0, 1.0)
+    inside = np.clip(argument_of_curve(context, of).numpy() / REACH, -1.0, 1.0)
     expected = np.polynomial.legendre.legval(inside, [0.0, *GAMMA.tolist()])
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-12, atol=1e-14)
     assert len(GAMMA) == DEGREE
@@ -52,8 +52,8 @@ def test_code_equals_the_curve(context, of):
 
 @pytest.fixture(scope="module")
 def diagnosis():
-    """A force to one side that grows with the square of the speed, in both directions of the pendulum."""
-    recording = swung(lambda _, speed: 0.12 * speed**2)
+    """Return the diagnosis of a pendulum with a hidden force of constant sign, by the square of its speed."""
+    recording = pendulum_recording(lambda _, speed: 0.12 * speed**2)
     # a catalogue of forces along the motion only
     effects = (LinearDrag(), QuadraticDrag(), UnknownRate("own"), UnknownRate("position"))
     return diagnose(Pendulum(), recording, effects=effects, surrogates=19, max_findings=1)

@@ -10,7 +10,7 @@ from mkc_torch.effects.paired.between import shifted
 from tests.effects.contexts import paired_context
 
 
-def test_units():
+def test_units_of_paired_effects_are_tidied_quotients_and_powers():
     units = {e.id: [q.unit for q in e.quantities({}, paired_context(e))] for e in PAIRED}
     assert units["driver_quadratic"] == ["V/A", "V/A²", "V"]
     assert (units["gain"], units["offset"], units["delay"]) == ([""], ["V"], ["s"])

@@ -23,7 +23,7 @@ def arm(**units):
 
 
 def terms(prepared, *names, port=None):
-    """The first candidate of each name, at a port."""
+    """Return the first candidate of each name, at a port."""
     every = candidate_terms(prepared, (), PAIRED)
     return [next(t for t in every if t.effect.id == name and t.port in (port, "all outputs")) for name in names]
 
@@ -47,7 +47,7 @@ def test_derivative_at_no_gap_is_the_direction_of_motion():
         assert not bool(slope[:, k, 1 - k].any())
 
 
-def test_play_and_a_delay_act_in_series():
+def test_play_and_a_delay_have_the_residual_of_both_in_series():
     simulator, recording = arm()
     prepared = simulator.prepare(recording)
     model = JointModel(prepared, terms(prepared, "backlash", "delay"))

@@ -16,7 +16,7 @@ ONE_POINT = make_context(GRADIENT, N=1, channels=ENU)
 
 
 def field(degree, point):
-    """The basis at a point, (terms, 3)."""
+    """Return the basis at a point, (terms, 3)."""
     shape, context = {"degree": degree}, replace(ONE_POINT, drivers=point.unsqueeze(0))
     return torch.stack(
         [GRADIENT.change(row, shape, context)[0] for row in torch.eye(size_of(GRADIENT, shape, context)).double()]
@@ -40,14 +40,14 @@ def test_the_basis_is_complete(degree, terms):
     assert int(torch.linalg.matrix_rank(table.movedim(1, -1).reshape(-1, terms))) == terms
 
 
-def test_degree_two_goes_on_from_degree_one():
+def test_the_basis_of_degree_two_starts_with_that_of_degree_one():
     point = torch.tensor([0.3, -0.7, 1.1], dtype=torch.float64)
     torch.testing.assert_close(field(2.0, point)[:5], field(1.0, point))
     torch.testing.assert_close(field(1.0, 2.0 * point), 2.0 * field(1.0, point))
     torch.testing.assert_close(field(2.0, 2.0 * point)[5:], 4.0 * field(2.0, point)[5:])
 
 
-def test_the_strength_alone_is_any_polynomial():
+def test_the_basis_of_the_field_strength_has_all_polynomials():
     context = make_context(GRADIENT, channels=("strength",))
     p = context.drivers
     x, y, z = p.unbind(-1)
@@ -66,7 +66,7 @@ def test_quantities_follow_the_port(channels, sizes):
     assert [tuple(q) for q in GRADIENT.quantities({"degree": 2.0}, context)] == [gradient, curvature]
 
 
-def test_positions_without_a_unit():
+def test_quantities_of_positions_without_a_unit_have_the_unit_of_the_field():
     context = replace(make_context(GRADIENT, channels=("strength",)), units=("", "", ""))
     assert [q.unit for q in GRADIENT.quantities({"degree": 2.0}, context)] == ["µT", "µT"]
 

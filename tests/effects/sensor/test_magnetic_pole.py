@@ -19,14 +19,14 @@ from mkc_torch.simulation import Magnetometer
 from tests.effects.contexts import make_context
 
 POLE, ENU = MagneticPole(), ("east", "north", "up")
-AT = {"place_x": 0.3, "place_y": -0.2, "place_z": 0.5, "radius": 0.0}
+SHAPE = {"place_x": 0.3, "place_y": -0.2, "place_z": 0.5, "radius": 0.0}
 ONE = torch.ones(1, dtype=torch.float64)
 CENTRE = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
 ONE_POINT = make_context(POLE, N=1, channels=ENU)
 
 
 def field(point):
-    return POLE.change(ONE, AT, replace(ONE_POINT, drivers=point.unsqueeze(0)))[0]
+    return POLE.change(ONE, SHAPE, replace(ONE_POINT, drivers=point.unsqueeze(0)))[0]
 
 
 def test_field_falls_with_the_square_of_the_distance():
@@ -42,16 +42,16 @@ def test_field_outside_the_pole_has_neither_sources_nor_curl():
         torch.testing.assert_close(slope, slope.mT)
 
 
-def test_within_its_radius_the_field_is_finite():
+def test_the_field_within_the_radius_of_a_pole_is_finite():
     at = replace(ONE_POINT, drivers=CENTRE.unsqueeze(0))
-    assert POLE.change(ONE, {**AT, "radius": 0.1}, at).tolist() == [[0.0, 0.0, 0.0]]
+    assert POLE.change(ONE, {**SHAPE, "radius": 0.1}, at).tolist() == [[0.0, 0.0, 0.0]]
 
 
-def test_the_strength_alone_is_the_field_along_a_direction_that_is_not_known():
+def test_the_change_of_the_field_strength_is_the_field_along_a_fitted_direction():
     context = make_context(POLE, channels=("strength",))
     along = torch.tensor([0.2, 0.5, -0.8], dtype=torch.float64)
-    vector = POLE.change(ONE, AT, replace(make_context(POLE, channels=ENU), drivers=context.drivers))
-    torch.testing.assert_close(POLE.change(along, AT, context).squeeze(-1), vector @ along)
+    vector = POLE.change(ONE, SHAPE, replace(make_context(POLE, channels=ENU), drivers=context.drivers))
+    torch.testing.assert_close(POLE.change(along, SHAPE, context).squeeze(-1), vector @ along)
 
 
 def columns(seed=0, N=1500):
@@ -66,7 +66,7 @@ def columns(seed=0, N=1500):
 
 
 def recording(source, moment):
-    """A recording of the strength of a field with a pole of this ``moment`` at ``source``."""
+    """Return a recording of the strength of a field with a pole of this ``moment`` at ``source``."""
     time, direction, place, noise = columns()
     away = place - torch.tensor(source, dtype=torch.float64)
     pole = moment * away / (away.square().sum(-1, keepdim=True) + 0.3**2) ** 1.5

@@ -28,12 +28,12 @@ class Oscillator(Dynamics):
 
 
 def oscillator(**attributes):
-    """An oscillator with other attributes."""
+    """Return an oscillator with other attributes."""
     return type("Oscillator", (Oscillator,), attributes)()
 
 
 def theta_of(prepared):
-    """The true parameters; each run starts at 0 with speed 0."""
+    """Return the true parameters; each run starts at 0 with speed 0."""
     return torch.tensor([STIFFNESS, DAMPING] + [0.0] * prepared.beginnings, dtype=torch.float64)
 
 
@@ -47,7 +47,7 @@ def held(slope, step):
 
 
 def flow(count, seen=((1.0, 0.0),), runs=1, step=STEP):
-    """The flow of the oscillator at 0, disturbed at its speed's rate: ``count`` samples a run, and residual 0."""
+    """Return the flow of the oscillator at 0 with residual 0, disturbed at the rate of its speed."""
     seen = np.atleast_2d(seen)
     A, B = held(SLOPE, step)
     N = count * runs
@@ -65,7 +65,7 @@ def flow(count, seen=((1.0, 0.0),), runs=1, step=STEP):
 
 
 def course(random, flow, lasting, size):
-    """A random disturbance at the samples, (N,), white or with a time constant, independent in each run."""
+    """Return a random disturbance at the samples, (N,), white or with a time constant, independent in each run."""
     shock = size * random.standard_normal(len(flow.new))
     value = shock.copy()
     for row, step in enumerate(flow.step):
@@ -84,12 +84,12 @@ def disturbed_states(flow, disturbance):
 
 
 def with_residual(flow, states, noise=0.0):
-    """The flow with the residual of these states and this noise."""
+    """Return the flow with the residual of these states and this noise."""
     return replace(flow, new=np.einsum("nij,nj->ni", flow.seen, states) + noise)
 
 
 def recorded(flow, runs=1, **columns):
-    """A table of columns at a flow's samples."""
+    """Return a table of columns at a flow's samples."""
     count = len(flow.new) // runs
     step = flow.step[flow.step > 0][0]
     table = {"time": torch.from_numpy(np.tile(np.arange(count) * step, runs))}

@@ -11,7 +11,7 @@ from mkc_torch.simulation.ports import SignalTimes
 
 
 def clock_of(time, begins, share):
-    """A time in each interval of a run, at this share of the interval."""
+    """Return times in each interval of a run, at this share of the interval."""
     before = torch.arange(len(time) - 1)[~begins[1:]]
     shares = torch.full((len(before),), share, dtype=torch.float64)
     return SignalTimes(torch.lerp(time[before], time[before + 1], shares), before, before + 1, shares)

@@ -31,8 +31,8 @@ class Pendulum(Dynamics):
         return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle) - p.damping * x.speed}
 
 
-def made(system, **attributes):
-    """An instance of a system with other attributes."""
+def instance(system, **attributes):
+    """Return an instance of a system with other attributes."""
     return type(system.__name__, (system,), attributes)()
 
 
@@ -55,7 +55,7 @@ def noisy(values, noise=0.01, outliers=0.0, seed=0):
     return values + noise * random.standard_normal(values.shape) + bad * random.standard_normal(values.shape)
 
 
-def found(system, recording):
+def fitted_parameters(system, recording):
     """Fitted parameters by their names."""
     prepared = system.prepare(recording)
     fit = fitted(JointModel(prepared), prepared.start())
@@ -70,7 +70,7 @@ class TestFit:
     """Fits to a recording."""
 
     def test_a_pendulum_with_unmeasured_speed_and_outliers_is_fitted(self):
-        values, fit = found(Pendulum(), table(time=TIME, angle=noisy(TRUTH[0], outliers=0.1)))
+        values, fit = fitted_parameters(Pendulum(), table(time=TIME, angle=noisy(TRUTH[0], outliers=0.1)))
         assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.02)
         assert values["damping"] == pytest.approx(DAMPING, abs=0.01)
         assert values["angle at the start"] == pytest.approx(FIRST[0], abs=0.01)
@@ -79,22 +79,22 @@ class TestFit:
 
     @pytest.mark.e2e
     def test_the_position_is_fitted_where_only_the_speed_is_measured(self):
-        values, _ = found(Pendulum(), table(time=TIME, speed=noisy(TRUTH[1], 0.02)))
+        values, _ = fitted_parameters(Pendulum(), table(time=TIME, speed=noisy(TRUTH[1], 0.02)))
         assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.03)
         assert values["angle at the start"] == pytest.approx(FIRST[0], abs=0.03)
 
-    def test_both_states_are_two_channels(self):
+    def test_two_measured_states_are_two_channels(self):
         recording = table(time=TIME, angle=noisy(TRUTH[0]), speed=noisy(TRUTH[1], 0.05))
         prepared = Pendulum().prepare(recording)
         assert prepared.channels == ("angle", "speed")
         assert prepared.unit == ""
-        values, fit = found(Pendulum(), recording)
+        values, fit = fitted_parameters(Pendulum(), recording)
         assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.02)
         assert fit.d.tolist() == pytest.approx([0.01, 0.05], rel=0.2)
 
-    def test_irregular_samples(self):
+    def test_a_pendulum_with_irregular_samples_is_fitted(self):
         time = np.sort(np.random.default_rng(3).uniform(0.0, 10.0, 400))
-        values, _ = found(Pendulum(), table(time=time, angle=noisy(swings(time)[0])))
+        values, _ = fitted_parameters(Pendulum(), table(time=time, angle=noisy(swings(time)[0])))
         assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.02)
         assert values["damping"] == pytest.approx(DAMPING, abs=0.01)
 
@@ -105,16 +105,16 @@ class TestFit:
         prepared = Pendulum().prepare(table(time=time, angle=swings(time)[0]))
         assert len(prepared.grid.time) > 60
         assert prepared.grid.time[prepared.rows].tolist() == pytest.approx(time.tolist())
-        values, fit = found(Pendulum(), table(time=time, angle=swings(time)[0]))
+        values, fit = fitted_parameters(Pendulum(), table(time=time, angle=swings(time)[0]))
         assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.01)
         assert float(fit.residual.abs().max()) < 0.01
-        coarse, _ = found(made(Pendulum, step=0.5), table(time=time, angle=swings(time)[0]))
+        coarse, _ = fitted_parameters(instance(Pendulum, step=0.5), table(time=time, angle=swings(time)[0]))
         assert abs(coarse["stiffness"] - STIFFNESS) > 0.1
 
-    def test_the_user_s_step_sets_the_grid(self):
+    def test_the_step_of_the_user_sets_the_grid(self):
         recording = table(time=TIME, angle=TRUTH[0])
-        assert len(made(Pendulum, step=0.02).prepare(recording).grid.time) == 500
-        assert len(made(Pendulum, step=0.005).prepare(recording).grid.time) == 4 * 499 + 1
+        assert len(instance(Pendulum, step=0.02).prepare(recording).grid.time) == 500
+        assert len(instance(Pendulum, step=0.005).prepare(recording).grid.time) == 4 * 499 + 1
 
     def test_experiments_share_parameters_but_not_initial_states(self):
         firsts = ((1.2, 0.4), (-0.6, 0.0), (0.3, 2.0))
@@ -124,7 +124,7 @@ class TestFit:
         prepared = Pendulum().prepare(recording)
         assert prepared.parameter_names[2::2] == tuple(f"angle at the start of {k}" for k in range(3))
         assert float(prepared.time_since_start().max()) == pytest.approx(time[-1])
-        values, _ = found(Pendulum(), recording)
+        values, _ = fitted_parameters(Pendulum(), recording)
         assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.05)
         for k, (angle_first, speed_first) in enumerate(firsts):
             assert values[f"angle at the start of {k}"] == pytest.approx(angle_first, abs=0.02)
@@ -141,14 +141,16 @@ class TestFit:
         )
         assert Pendulum().prepare(recording).parameter_names[2] == "angle at the start of slow"
 
-    def test_a_bound_is_kept(self):
-        held = made(Pendulum, parameters={"stiffness": Parameter(7.0, upper=8.5), "damping": Parameter(0.5, lower=0.2)})
-        values, _ = found(held, table(time=TIME, angle=TRUTH[0]))
+    def test_a_fitted_parameter_stays_within_its_bound(self):
+        held = instance(
+            Pendulum, parameters={"stiffness": Parameter(7.0, upper=8.5), "damping": Parameter(0.5, lower=0.2)}
+        )
+        values, _ = fitted_parameters(held, table(time=TIME, angle=TRUTH[0]))
         assert values["stiffness"] <= 8.5
         assert values["damping"] >= 0.2
 
-    def test_unmeasured_states_start_at_the_user_s_initial_value(self):
-        other = made(Pendulum, initial={"angle": 0.7})
+    def test_unmeasured_states_start_at_the_initial_value_of_the_user(self):
+        other = instance(Pendulum, initial={"angle": 0.7})
         start = other.prepare(table(time=TIME, speed=TRUTH[1])).start()
         assert float(start[2]) == 0.7
         assert float(start[3]) == pytest.approx(FIRST[1], abs=0.2)
@@ -158,7 +160,7 @@ class TestFit:
             return [x.speed, -p.stiffness * torch.sin(x.angle) - p.damping * x.speed]
 
         recording = table(time=TIME, angle=TRUTH[0])
-        by_order, by_name = made(Pendulum, derivative=derivative).prepare(recording), Pendulum().prepare(recording)
+        by_order, by_name = instance(Pendulum, derivative=derivative).prepare(recording), Pendulum().prepare(recording)
         torch.testing.assert_close(by_order.residual(by_name.start(), {}), by_name.residual(by_name.start(), {}))
 
     @pytest.mark.e2e
@@ -167,8 +169,8 @@ class TestFit:
             return {"tip": p.length * torch.sin(x.angle)}
 
         parameters = {**Pendulum.parameters, "length": Parameter(1.0, lower=0.0)}
-        system = made(Pendulum, outputs=("tip",), output=output, parameters=parameters, initial={"angle": 1.0})
-        values, _ = found(system, table(time=TIME, tip=noisy(0.7 * np.sin(TRUTH[0]))))
+        system = instance(Pendulum, outputs=("tip",), output=output, parameters=parameters, initial={"angle": 1.0})
+        values, _ = fitted_parameters(system, table(time=TIME, tip=noisy(0.7 * np.sin(TRUTH[0]))))
         assert values["length"] == pytest.approx(0.7, abs=0.01)
         assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.05)
 
@@ -195,7 +197,7 @@ class TestFit:
 
         exploding = type("Exploding", (Dynamics,), {"states": ("level",), "parameters": {"rate": 0.1}})
         time = np.arange(100) * 0.02
-        prepared = made(exploding, derivative=derivative).prepare(table(time=time, level=1.0 / (1.0 - 0.1 * time)))
+        prepared = instance(exploding, derivative=derivative).prepare(table(time=time, level=1.0 / (1.0 - 0.1 * time)))
         assert bool(prepared.residual(torch.tensor([0.1, 1.0]).double(), {}).isfinite().all())
         assert bool(prepared.residual(torch.tensor([2.0, 1.0]).double(), {}).isnan().all())
         assert bool(prepared.residual(torch.tensor([0.1, 1.0]).double(), {}).isfinite().all())
@@ -236,7 +238,7 @@ class TestInputs:
         theta = torch.tensor([STIFFNESS, DAMPING, 0.2, 0.0], dtype=torch.float64)
         sizes = {}
         for between in ("held", "linear", "smooth"):
-            prepared = made(Driven, input_hold=between, step=0.02).prepare(recording)
+            prepared = instance(Driven, input_hold=between, step=0.02).prepare(recording)
             sizes[between] = float(prepared.residual(theta, {}).abs().max())
         assert min(sizes, key=sizes.get) == course
         assert sizes[course] < 0.004
@@ -260,13 +262,13 @@ class TestInputs:
             charge=np.tile(exact.y[0], 2),
             experiment=np.repeat([0.0, 1.0], 101),
         )
-        values, _ = found(heated(), recording)
+        values, _ = fitted_parameters(heated(), recording)
         assert values["gain"] == pytest.approx(2.0, abs=1e-3)
         assert values["loss"] == pytest.approx(0.5, abs=1e-3)
 
     def test_short_runs_are_interpolated_by_straight_lines(self):
         time, torque = np.arange(5) * 0.1, np.array([0.0, 1.0, 0.0, 2.0, 0.0])
-        prepared = made(Driven, input_hold="smooth", step=0.1).prepare(
+        prepared = instance(Driven, input_hold="smooth", step=0.1).prepare(
             table(time=time, angle=0.1 * time, torque=torque)
         )
         torch.testing.assert_close(prepared.inputs[1::3, 0], torch.tensor([0.5, 0.5, 1.0, 1.0]).double())
@@ -298,22 +300,22 @@ class TestSegments:
     @pytest.mark.e2e
     def test_a_chaotic_recording_is_fitted_in_segments_only(self):
         recording = table(time=self.time, **dict(zip("xyz", noisy(lorenz(self.time), 0.1), strict=True)))
-        values, fit = found(made(Lorenz, restart_after=1.0), recording)
+        values, fit = fitted_parameters(instance(Lorenz, restart_after=1.0), recording)
         assert [values[name] for name in ("sigma", "rho", "beta")] == pytest.approx([10.0, 28.0, 8.0 / 3.0], rel=0.01)
         assert fit.d.tolist() == pytest.approx([0.1] * 3, rel=0.2)
-        whole = made(Lorenz).prepare(recording)
+        whole = instance(Lorenz).prepare(recording)
         theta = torch.tensor([10.0, 28.0, 8.0 / 3.0, *whole.measured[0].tolist()], dtype=torch.float64)
         left = whole.residual(theta, {})
         assert not bool(left.isfinite().all()) or float(left.abs().max()) > 5.0
 
     def test_segments_are_named_by_their_time(self):
-        names = made(Pendulum, restart_after=2.0).prepare(table(time=TIME, angle=TRUTH[0])).parameter_names
+        names = instance(Pendulum, restart_after=2.0).prepare(table(time=TIME, angle=TRUTH[0])).parameter_names
         assert names[2::2] == tuple(f"angle at the start, {k} s" for k in (0, 2, 4, 6, 8))
 
     @pytest.mark.parametrize("more", [0, 1, 2, 3])
     def test_a_short_remainder_joins_the_segment_before(self, more):
         time = np.arange(100 + more) * 0.02
-        prepared = made(Pendulum, restart_after=1.0).prepare(table(time=time, angle=swings(time)[0]))
+        prepared = instance(Pendulum, restart_after=1.0).prepare(table(time=time, angle=swings(time)[0]))
         assert int(prepared.begins.sum()) == (3 if more == 3 else 2)
 
     def test_every_experiment_is_split(self):
@@ -321,7 +323,7 @@ class TestSegments:
         recording = table(
             time=np.tile(time, 2), angle=np.tile(swings(time)[0], 2), experiment=np.repeat([0.0, 1.0], 101)
         )
-        prepared = made(Pendulum, restart_after=1.0).prepare(recording)
+        prepared = instance(Pendulum, restart_after=1.0).prepare(recording)
         assert prepared.begins.nonzero().squeeze(-1).tolist() == [0, 50, 101, 151]
         assert prepared.labels == [" of 0, 0 s", " of 0, 1 s", " of 1, 0 s", " of 1, 1 s"]
 
@@ -343,7 +345,7 @@ class TestPorts:
     """Ports, and the signals that effects at them can refer to."""
 
     def pendulum(self, **attributes):
-        return made(Pendulum, **attributes).prepare(table(time=TIME, angle=TRUTH[0])).ports
+        return instance(Pendulum, **attributes).prepare(table(time=TIME, angle=TRUTH[0])).ports
 
     def test_ports_of_a_pendulum(self):
         ports = self.pendulum()
@@ -399,7 +401,7 @@ class TestPorts:
     def test_states_of_different_units_have_no_exchange_port(self):
         time = np.arange(50) * 0.1
         recording = table(time=time, upper=np.exp(-time), lower=np.exp(-time), pump=0 * time)
-        ports = made(Tanks, units={"upper": "m", "lower": "°C"}).prepare(recording).ports
+        ports = instance(Tanks, units={"upper": "m", "lower": "°C"}).prepare(recording).ports
         assert not [name for name in ports if name.startswith("exchange")]
         assert ports["rate of lower"].parts["temperature"] == "lower"
 
@@ -426,7 +428,7 @@ class TestPorts:
         torch.testing.assert_close(shown, 0.5 * before)
 
     def test_signals_equal_those_passed_to_effects(self):
-        prepared = made(Driven, step=0.02).prepare(table(time=TIME, angle=TRUTH[0], torque=np.sin(TIME)))
+        prepared = instance(Driven, step=0.02).prepare(table(time=TIME, angle=TRUTH[0], torque=np.sin(TIME)))
         theta = torch.tensor([STIFFNESS, DAMPING, *FIRST], dtype=torch.float64)
         seen = {}
 
@@ -451,7 +453,7 @@ class TestPorts:
             braking = (p.damping + 2.0 * u.enabled) * x.speed
             return {"angle": x.speed, "speed": 5.0 * u.drive - braking - p.stiffness * x.angle}
 
-        system = made(Pendulum, inputs=("drive", "enabled"), derivative=derivative)
+        system = instance(Pendulum, inputs=("drive", "enabled"), derivative=derivative)
         inputs = {"drive": np.sin(TIME), "enabled": (TIME > 2.0).astype(float)}
         prepared = system.prepare(table(time=TIME, angle=TRUTH[0], **inputs))
         signals = prepared.signals(torch.tensor([STIFFNESS, DAMPING, *FIRST], dtype=torch.float64), {})
@@ -529,8 +531,8 @@ class Block(Dynamics):
         return {"place": x.speed, "speed": spring - x.speed - p.friction * torch.tanh(x.speed / 0.0005)}
 
 
-def dragged(pull):
-    """The place of a block that sticks fully, by short steps; the pull is held between samples."""
+def sticking_positions(pull):
+    """Return the positions of a block that sticks fully, by short steps; the pull is held between samples."""
     place, speed, places = 0.0, 0.0, []
     for now in pull:
         places.append(place)
@@ -546,7 +548,7 @@ def test_a_sticking_simulation_is_solved_over_a_horizon_of_small_strides(monkeyp
     """Friction is nearly a jump: no trajectory is found from the guess, but the correction needs a trajectory."""
     time = np.arange(80) * 0.02
     pull = 0.6 * np.sin(1.1 * time) + 0.3 * np.sign(np.sin(0.7 * time))
-    truth = dragged(pull)
+    truth = sticking_positions(pull)
     correction = DynamicsCorrection(Block().prepare(table(time=time, pull=pull, place=noisy(truth, 0.003))), first=0.3)
     theta = correction.prepared.start()
     assert not correction.prepared.trajectory(theta, {}).converged
@@ -588,11 +590,11 @@ class TestUndetermined:
 
     @pytest.mark.e2e
     def test_the_diagnosis_repeats_the_warning_once(self):
-        diagnosis = diagnose(made(Oscillator, step=0.02), self.recording, effects=(), surrogates=19)
+        diagnosis = diagnose(instance(Oscillator, step=0.02), self.recording, effects=(), surrogates=19)
         assert sum("does not determine `mass` and `spring`" in warning for warning in diagnosis.warnings) == 1
 
     def test_a_parameter_without_influence_is_named(self):
-        idle = made(Oscillator, parameters={**Oscillator.parameters, "mass": 1.0, "colour": 5.0})
+        idle = instance(Oscillator, parameters={**Oscillator.parameters, "mass": 1.0, "colour": 5.0})
         assert "The recording does not determine `colour`: whatever it is, the residual is the same." in (
             idle.prepare(self.recording).warnings
         )
@@ -600,7 +602,7 @@ class TestUndetermined:
     def test_determined_parameters_give_no_warning(self):
         assert Pendulum().prepare(table(time=TIME, angle=TRUTH[0])).warnings == ()
         at_rest = table(time=TIME, angle=swings(TIME, (0.5, 0.0), damping=0.0)[0])
-        assert made(Pendulum, parameters={"stiffness": 9.0, "damping": 0.0}).prepare(at_rest).warnings == ()
+        assert instance(Pendulum, parameters={"stiffness": 9.0, "damping": 0.0}).prepare(at_rest).warnings == ()
 
     def test_an_undetermined_initial_state_gives_no_warning(self):
         """A state without influence on the outputs is not a fault of the recording."""
@@ -636,15 +638,15 @@ class TestActuatorsAndSensors:
         time = np.arange(100) * 0.02
         recording = table(time=time, angle=0.0 * time, torque=np.sin(time), experiment=np.repeat([3.0, 5.0], 50))
         theta = torch.tensor([STIFFNESS, DAMPING, 0.1, 0.0, 0.2, 0.0], dtype=torch.float64)
-        plain = made(Driven, step=0.02).prepare(recording)
-        own = made(Driven, step=0.02, actuator=actuator, sensor=sensor).prepare(recording)
+        plain = instance(Driven, step=0.02).prepare(recording)
+        own = instance(Driven, step=0.02, actuator=actuator, sensor=sensor).prepare(recording)
         doubled = plain.simulated(theta, {"input torque": lambda s: s})
         torch.testing.assert_close(own.simulated(theta, {}), doubled + 0.5)
         assert set(seen["run"].tolist()) == {0, 1}
 
     def test_an_actuator_that_omits_an_input_raises(self):
         with pytest.raises(SimulationError, match=r"actuator does not return the input `torque`"):
-            made(Driven, actuator=lambda *_: {}).prepare(table(**GOOD, torque=0.0 * TIME))
+            instance(Driven, actuator=lambda *_: {}).prepare(table(**VALID, torque=0.0 * TIME))
 
 
 # invalid systems
@@ -657,43 +659,43 @@ def returning(value):
     return derivative
 
 
-GOOD = {"time": TIME, "angle": TRUTH[0]}
+VALID = {"time": TIME, "angle": TRUTH[0]}
 
-BAD = {
+INVALID = {
     "a shape": (
         {"derivative": returning(lambda x, _: {"angle": x.speed, "speed": torch.ones(7)})},
-        GOOD,
+        VALID,
         r"Pendulum.derivative: the rate of `speed` .*\(1497,\), .*\(7,\)",
     ),
     "a matrix": (
         {"derivative": returning(lambda x, _: {"angle": x.speed, "speed": x.angle.unsqueeze(-1)})},
-        GOOD,
+        VALID,
         r"rate of `speed` .*\(1497, 1\)",
     ),
     "no tensor": (
         {"derivative": returning(lambda x, _: {"angle": x.speed, "speed": "fast"})},
-        GOOD,
+        VALID,
         r"rate of `speed` .* str",
     ),
     "other names": (
         {"derivative": returning(lambda x, _: {"angle": x.speed, "velocity": x.angle})},
-        GOOD,
+        VALID,
         r"returns rates of angle, velocity but the states are angle, speed; return one rate for each",
     ),
     "too few by name": (
         {"derivative": returning(lambda x, _: {"angle": x.speed})},
-        GOOD,
+        VALID,
         r"returns rates of angle but the states are angle, speed",
     ),
     "too few in order": (
         {"derivative": returning(lambda x, _: [x.speed])},
-        GOOD,
+        VALID,
         r"returns 1 rates for 2 states \(angle, speed\)",
     ),
-    "nothing": ({"derivative": returning(lambda *_: None)}, GOOD, r"derivative returns NoneType; return the rate"),
+    "nothing": ({"derivative": returning(lambda *_: None)}, VALID, r"derivative returns NoneType; return the rate"),
     "NaN": (
         {"derivative": returning(lambda x, p: {"angle": x.speed, "speed": p.stiffness * (x.angle - 1.1).sqrt()})},
-        GOOD,
+        VALID,
         r"the rate of `speed` is nan at time 0\.\d+ s with angle = 1\.[01]\d*, speed = -\d.*; "
         r"parameters stiffness = 7, damping = 0\.5\. Keep it finite",
     ),
@@ -705,22 +707,22 @@ BAD = {
     "short": ({}, {"time": TIME[:2], "angle": TRUTH[0, :2]}, r"a run of 2 samples is too short .* at least 3"),
     "a short run": (
         {},
-        {**GOOD, "experiment": np.array([1.0, 1.0] + 498 * [2.0])},
+        {**VALID, "experiment": np.array([1.0, 1.0] + 498 * [2.0])},
         r"a run of 2 samples is too short",
     ),
-    "short segments": ({"restart_after": 0.03}, GOOD, r"too short .* or use longer segments"),
+    "short segments": ({"restart_after": 0.03}, VALID, r"too short .* or use longer segments"),
     "between": (
         {"input_hold": "cubic"},
-        GOOD,
+        VALID,
         r"`input_hold` .*\"held\", \"linear\" or \"smooth\".*'cubic'",
     ),
     "twice": (
         {"parameters": {"angle": 1.0}},
-        GOOD,
+        VALID,
         r"uses the name `angle` twice among states, inputs and parameters",
     ),
-    "no states": ({"states": ()}, GOOD, r"has no `states`; name them"),
-    "no attribute": ({"parameters": {"spring rate": 1.0}}, GOOD, r"`spring rate` cannot be an attribute"),
+    "no states": ({"states": ()}, VALID, r"has no `states`; name them"),
+    "no attribute": ({"parameters": {"spring rate": 1.0}}, VALID, r"`spring rate` cannot be an attribute"),
     "another output": (
         {"outputs": ("tip",), "output": lambda *_: {"top": torch.ones(1)}},
         {"time": TIME, "tip": TRUTH[0]},
@@ -739,20 +741,20 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize(("attributes", "columns", "message"), BAD.values(), ids=BAD)
+@pytest.mark.parametrize(("attributes", "columns", "message"), INVALID.values(), ids=INVALID)
 def test_invalid_systems_raise_with_the_place_of_the_fault(attributes, columns, message):
     with pytest.raises(SimulationError, match=message):
-        made(Pendulum, **attributes).prepare(table(**columns))
+        instance(Pendulum, **attributes).prepare(table(**columns))
 
 
 def test_a_missing_input_is_named():
     with pytest.raises(MissingColumnError, match=r"there is no column `torque`; there are `time`, `angle`"):
-        Driven().prepare(table(**GOOD))
+        Driven().prepare(table(**VALID))
 
 
 def test_a_system_without_a_derivative_raises():
     with pytest.raises(NotImplementedError, match=r"Empty has no `derivative\(self, time, x, u, p\)`"):
-        type("Empty", (Dynamics,), {"states": ("angle",)})().prepare(table(**GOOD))
+        type("Empty", (Dynamics,), {"states": ("angle",)})().prepare(table(**VALID))
 
 
 def test_rows_that_are_not_finite_are_dropped():

@@ -12,7 +12,7 @@ from tests.simulation.dynamics.oscillating import flow, oscillator, recorded, th
 from tests.simulation.dynamics.runge_kutta import runge_kutta
 
 STIFFNESS, DAMPING, FIRST, NOISE = 9.0, 0.15, (1.8, 0.4), 0.01
-ALONG = flow(400)
+FLOW = flow(400)
 
 
 class Pendulum(Dynamics):
@@ -29,9 +29,9 @@ def rate(_, y):
 
 @pytest.fixture(scope="module")
 def pendulum():
-    """A prepared pendulum that swings for 20 s."""
+    """Return a prepared pendulum that swings for 20 s."""
     angle = runge_kutta(rate, FIRST, 0.05 * np.arange(400), parts=5)[:, 0]
-    return Pendulum().prepare(recorded(ALONG, angle=angle + NOISE * np.random.default_rng(0).standard_normal(400)))
+    return Pendulum().prepare(recorded(FLOW, angle=angle + NOISE * np.random.default_rng(0).standard_normal(400)))
 
 
 @pytest.mark.e2e

@@ -15,7 +15,7 @@ TINY = 1e-3
 
 
 def disturbed_oscillator(count=80, runs=1, scale=1.0, **attributes):
-    """A prepared oscillator with white process noise, its parameters, and its exact flow."""
+    """Return a prepared oscillator with white process noise, its parameters, and its exact flow."""
     expected, random = flow(count, runs=runs), np.random.default_rng(0)
     position = disturbed_states(expected, course(random, expected, 0.0, 1.0))[:, 0] + NOISE * random.standard_normal(
         count * runs
@@ -112,7 +112,7 @@ def test_no_flow_without_a_trajectory():
 
 
 @pytest.mark.parametrize("runs", [1, 2])
-def test_an_observer_s_residual_equals_filter_innovations_along_the_open_loop(runs):
+def test_the_residual_of_an_observer_equals_filter_innovations_along_the_open_loop(runs):
     """On a linear system, with innovations too small to be clipped."""
     prepared, theta, _ = disturbed_oscillator(runs=runs, scale=TINY)
     white = Disturbance("speed", True, 0.0, 1.0)

@@ -14,18 +14,18 @@ from tests.simulation.dynamics.oscillating import course, disturbed_states, flow
 TINY = 1e-3
 """Scale of the residuals relative to the model, so small that clipping has no effect."""
 
-BOTH = ((1.0, 0.0), (0.3, 1.0))
+TWO_OUTPUTS = ((1.0, 0.0), (0.3, 1.0))
 
 
 def model(white=0.0, place=(), size=(), lasting=(), sensor=(0.1,)):
-    """A noise model of the oscillator, with process noise of its speed."""
+    """Return a noise model of the oscillator, with process noise of its speed."""
     return FilterModels(
         np.array([[white]]), np.array([place], dtype=int), np.array([size]), np.array([lasting]), np.array([sensor])
     )
 
 
-def together(*models):
-    """A batch of models of the same shape."""
+def batch(*models):
+    """Return a batch of models of the same shape."""
     parts = ((getattr(model, name) for model in models) for name in ("white", "place", "size", "lasting", "sensor"))
     return FilterModels(*(np.concatenate(list(part)) for part in parts))
 
@@ -52,7 +52,7 @@ def memory(flow, lasting):
     return np.exp(-np.abs(time[:, None] - time) / lasting) * (run[:, None] == run)
 
 
-def dense(flow, models):
+def dense_covariance(flow, models):
     """Covariance of all residuals, (N·m, N·m), and of each lasting disturbance with them, (D, N, N·m)."""
     N, m = flow.new.shape
     G = responses_to_disturbances(flow).reshape(N * m, N)
@@ -71,23 +71,23 @@ def dense(flow, models):
 
 
 def recording(flow, models, seed=0):
-    """The flow with a residual drawn from the model, times ``TINY``, and with masked samples."""
+    """Return the flow with a residual drawn from the model, times ``TINY``, and with masked samples."""
     random = np.random.default_rng(seed)
-    covariance, _ = dense(flow, models)
+    covariance, _ = dense_covariance(flow, models)
     new = TINY * (np.linalg.cholesky(covariance) @ random.standard_normal(len(covariance))).reshape(flow.new.shape)
     return replace(flow, new=new, counts=(random.random(new.shape) > 0.1).astype(float))
 
 
 def log_likelihood(flow, models):
     """Determinant term of the unmasked samples' log-likelihood, and its exponent divided by ``TINY**2``."""
-    covariance, _ = dense(flow, models)
+    covariance, _ = dense_covariance(flow, models)
     used = flow.counts.ravel() > 0
     covariance, new = covariance[np.ix_(used, used)], flow.new.ravel()[used]
     return -0.5 * np.linalg.slogdet(covariance)[1], new @ np.linalg.solve(covariance, new) / TINY**2
 
 
 @pytest.mark.parametrize("runs", [1, 3])
-@pytest.mark.parametrize("seen", [((1.0, 0.0),), BOTH], ids=["one output", "two outputs"])
+@pytest.mark.parametrize("seen", [((1.0, 0.0),), TWO_OUTPUTS], ids=["one output", "two outputs"])
 @pytest.mark.parametrize("kind", MODELS)
 def test_innovations_have_the_likelihood_of_the_joint_distribution(kind, seen, runs):
     models = replace(MODELS[kind], sensor=np.array([[0.1, 0.2][: len(seen)]]))
@@ -105,7 +105,7 @@ def test_innovations_have_the_likelihood_of_the_joint_distribution(kind, seen, r
 def test_models_in_a_batch_are_independent():
     first, second = MODELS["slow process"], model(white=1.0, place=(1,), size=(0.2,), lasting=(3.0,))
     along = recording(flow(20), first)
-    found = filtered(along.whole, together(first, second))
+    found = filtered(along.whole, batch(first, second))
     for number, alone in enumerate((first, second)):
         expected = filtered(along.whole, alone)
         np.testing.assert_allclose(found.standard[:, :, number], expected.standard[:, :, 0], rtol=1e-12)
@@ -161,7 +161,7 @@ def test_innovations_are_clipped():
 def test_smoothed_disturbances_are_conditional_means_and_covariances(kind, runs):
     models = MODELS[kind]
     along = recording(flow(15, runs=runs), models)
-    covariance, cross = dense(along, models)
+    covariance, cross = dense_covariance(along, models)
     used = along.counts.ravel() > 0
     covariance, new = covariance[np.ix_(used, used)], along.new.ravel()[used]
     state, spread = smoothed(along, models, filtered(along.whole, models, keep=True))
@@ -176,7 +176,7 @@ def test_smoothed_states_are_conditional_means_and_covariances():
     """With white process noise only, by the states' covariance with all residuals."""
     models = MODELS["white process"]
     along = recording(flow(15), models)
-    covariance, _ = dense(along, models)
+    covariance, _ = dense_covariance(along, models)
     N, used = len(along.new), along.counts.ravel() > 0
     by = np.stack([disturbed_states(along, row) for row in np.eye(N)], -1)  # (N, n, N)
     cross = 4.0 * np.einsum("inp,jp->inj", by, responses_to_disturbances(along)[:, 0])[..., used]
@@ -195,7 +195,7 @@ class TestParts:
     @given(count=st.integers(4, 60), runs=st.integers(1, 3), length=st.integers(1, 80), before=st.integers(0, 20))
     @settings(max_examples=40, deadline=None, derandomize=True)
     def test_each_sample_belongs_to_exactly_one_stretch(self, count, runs, length, before):
-        along = flow(count, BOTH, runs)
+        along = flow(count, TWO_OUTPUTS, runs)
         along.counts[::3, 1] = 0.0
         along.new[:] = np.arange(along.new.size).reshape(along.new.shape) + 1.0
         parts = along.in_parts(length, before)
@@ -204,7 +204,7 @@ class TestParts:
         assert bool((parts.counts >= parts.mine).all())
 
     def test_a_limited_number_of_stretches_is_an_even_subset(self):
-        along = flow(1000, BOTH)
+        along = flow(1000, TWO_OUTPUTS)
         along.new[:] = np.arange(along.new.size).reshape(along.new.shape) + 1.0
         every, some = along.in_parts(100, 20), along.in_parts(100, 20, 4)
         for name in ("transition", "seen", "new", "shift", "step", "counts", "mine"):
@@ -220,7 +220,7 @@ class TestParts:
         assert not along.whole.inside.any()
 
     def test_stretches_have_nearly_the_likelihood_of_the_whole_flow(self):
-        models = together(MODELS["white process"], model(white=4.0), model(white=2.0, sensor=(0.15,)))
+        models = batch(MODELS["white process"], model(white=4.0), model(white=2.0, sensor=(0.15,)))
         along, random = flow(600), np.random.default_rng(2)
         along = with_residual(
             along, disturbed_states(along, course(random, along, 0.0, 2.0)), 0.1 * random.standard_normal((600, 1))

@@ -16,14 +16,14 @@ from mkc_torch.simulation.dynamics.loops.recurrence import pass_on
 from mkc_torch.simulation.dynamics.loops.whiten import whiten_samples
 from mkc_torch.simulation.dynamics.whitening import SeriesAlong, gains_of, whitened
 from tests.simulation.dynamics.oscillating import flow
-from tests.simulation.dynamics.test_kalman import BOTH, MODELS, model, together
+from tests.simulation.dynamics.test_kalman import MODELS, TWO_OUTPUTS, batch, model
 from tests.simulation.dynamics.test_parallel_filter import recorded
 
 WAYS = {"machine code": machine_code, "Python": lambda loop: loop, "NumPy": lambda _: None}
 
 
 def in_each_way(monkeypatch, module, compute):
-    """The results by machine code, by the loop in Python, and by NumPy."""
+    """Return the results by machine code, by the loop in Python, and by NumPy."""
     found = []
     for way in WAYS.values():
         with monkeypatch.context() as patch:
@@ -40,8 +40,8 @@ def assert_alike(found):
 
 
 @pytest.fixture
-def along():
-    return recorded(flow(60, BOTH, runs=2))
+def oscillator_flow():
+    return recorded(flow(60, TWO_OUTPUTS, runs=2))
 
 
 def test_numba_is_installed_with_the_tests():
@@ -50,12 +50,12 @@ def test_numba_is_installed_with_the_tests():
 
 @pytest.mark.parametrize("keep", [True, False])
 @pytest.mark.parametrize("given", [True, False])
-def test_filters_agree(along, keep, given, monkeypatch):
-    models = together(model(white=2.0, sensor=(0.1, 0.2)), model(white=0.5, sensor=(0.3, 0.1)))
+def test_filters_by_python_machine_code_and_numpy_agree(oscillator_flow, keep, given, monkeypatch):
+    models = batch(model(white=2.0, sensor=(0.1, 0.2)), model(white=0.5, sensor=(0.3, 0.1)))
 
     def filtered():
         start = start_of(np.full((1, 2, 2), 0.3), models) if given else None
-        left, end = run_filter(along.whole, models, keep=keep, start=start)
+        left, end = run_filter(oscillator_flow.whole, models, keep=keep, start=start)
         last = (end.state, end.covariance, *((end.kept,) if given else ()))
         return left.standard, left.log_spread, left.prior, left.state, left.after, left.posterior, *last
 
@@ -63,7 +63,7 @@ def test_filters_agree(along, keep, given, monkeypatch):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_whitened_series_agree(name, monkeypatch):
+def test_whitened_series_by_python_machine_code_and_numpy_agree(name, monkeypatch):
     along, random = recorded(flow(40, runs=2)), np.random.default_rng(1)
     gains = gains_of(along, MODELS[name])
     series = SeriesAlong(random.standard_normal((*along.new.shape, 3)), random.standard_normal((*along.shift.shape, 3)))
@@ -74,7 +74,7 @@ def test_whitened_series_agree(name, monkeypatch):
     assert_alike(in_each_way(monkeypatch, whitening, innovations))
 
 
-def test_recurrences_agree(monkeypatch):
+def test_recurrences_by_python_machine_code_and_numpy_agree(monkeypatch):
     random = np.random.default_rng(2)
     carries = 0.5 * random.standard_normal((2, 2, 400))
     carries[..., [0, 150]] = 0.0

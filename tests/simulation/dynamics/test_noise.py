@@ -15,7 +15,7 @@ DRIFT = Disturbance("position", False, 1.0, 0.1)
 
 
 def disturbed_oscillator(*disturbances, count=300, runs=1, seed=0):
-    """A prepared oscillator under these disturbances, its parameters, and the disturbances over time."""
+    """Return a prepared oscillator under these disturbances, its parameters, and the disturbances over time."""
     along, random = flow(count, runs=runs), np.random.default_rng(seed)
     courses = [course(random, along, disturbance.lasting, disturbance.size) for disturbance in disturbances]
     process_noise = sum(
@@ -28,7 +28,7 @@ def disturbed_oscillator(*disturbances, count=300, runs=1, seed=0):
     return prepared, theta_of(prepared), courses
 
 
-def known(theta, *disturbances):
+def noise_model_of(theta, *disturbances):
     return SelectedNoise(disturbances, (), (), theta.new_tensor([NOISE]), 0.0, (False,))
 
 
@@ -42,7 +42,7 @@ class TestPaths:
     @pytest.mark.parametrize("truth", [(WHITE,), (SLOW,), (DRIFT,), (SLOW, DRIFT)])
     def test_two_standard_errors_cover_the_truth_in_95_percent_of_samples(self, truth):
         prepared, theta, courses = disturbed_oscillator(*truth, count=100, runs=8)
-        found = disturbance_paths(prepared, theta, {}, None, known(theta, *truth))
+        found = disturbance_paths(prepared, theta, {}, None, noise_model_of(theta, *truth))
         assert len(found) == len(truth)
         for path, expected, disturbance in zip(found, courses, truth, strict=True):
             away = (path.value - torch.from_numpy(expected)) / path.error
@@ -53,20 +53,20 @@ class TestPaths:
 
     def test_slow_process_noise_is_estimated(self):
         prepared, theta, (expected,) = disturbed_oscillator(SLOW)
-        (path,) = disturbance_paths(prepared, theta, {}, None, known(theta, SLOW))
+        (path,) = disturbance_paths(prepared, theta, {}, None, noise_model_of(theta, SLOW))
         assert np.corrcoef(path.value.numpy(), expected)[0, 1] > 0.8
 
     def test_the_estimate_is_the_same_along_an_observed_run(self):
         """Its states are closer to the truth; its disturbances are the same."""
         prepared, theta, _ = disturbed_oscillator(SLOW)
-        found = select_noise(prepared, theta, known=known(theta, SLOW))
+        found = select_noise(prepared, theta, known=noise_model_of(theta, SLOW))
         (free,) = disturbance_paths(prepared, theta, {}, None, found.selected)
         (corrected,) = disturbance_paths(prepared.observed(found.observer), theta, {}, None, found.selected)
         assert float((free.value - corrected.value).abs().max()) < 0.25 * float(free.error.median())
 
     def test_no_paths_without_disturbances(self):
         prepared, theta, _ = disturbed_oscillator(count=40)
-        assert disturbance_paths(prepared, theta, {}, None, known(theta)) == ()
+        assert disturbance_paths(prepared, theta, {}, None, noise_model_of(theta)) == ()
 
 
 class TestMostLikelyNoise:
@@ -119,12 +119,12 @@ class TestMostLikelyNoise:
 
     def test_known_disturbances_are_rescaled_and_removed_without_gain(self):
         prepared, theta, _ = disturbed_oscillator(WHITE)
-        found = select_noise(prepared, theta, known=known(theta, Disturbance("speed", True, 0.0, 30.0), DRIFT))
+        found = select_noise(prepared, theta, known=noise_model_of(theta, Disturbance("speed", True, 0.0, 30.0), DRIFT))
         (disturbance,) = found.selected.disturbances
         assert (disturbance.place, disturbance.lasting) == ("speed", 0.0)
         assert abs(np.log(disturbance.size)) < 3.0 * found.selected.errors[0]
         calm, theta, _ = disturbed_oscillator()
-        assert select_noise(calm, theta, known=known(theta, WHITE)).observer is None
+        assert select_noise(calm, theta, known=noise_model_of(theta, WHITE)).observer is None
 
     def test_no_noise_without_a_trajectory(self):
         prepared, theta, _ = disturbed_oscillator(count=40)
@@ -135,7 +135,7 @@ class TestMostLikelyNoise:
         prepared, *_ = disturbed_oscillator(count=40)
         assert noise_of(prepared, {}) is None
 
-    def test_the_noise_of_an_observed_simulation_is_its_observer_s(self):
+    def test_the_noise_of_an_observed_simulation_is_that_of_its_observer(self):
         prepared, theta, _ = disturbed_oscillator(WHITE)
         observer = select_noise(prepared, theta).observer
         found = noise_of(prepared.observed(observer), {})

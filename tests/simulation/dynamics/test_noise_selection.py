@@ -31,7 +31,7 @@ SENSOR = Disturbance("position", False, LASTING, DRIFT)
 
 
 def noisy_flow(*disturbances, count=300, seed=0, noise=NOISE, runs=1):
-    """The flow of an oscillator under these disturbances, with white sensor noise."""
+    """Return the flow of an oscillator under these disturbances, with white sensor noise."""
     along, random = flow(count, runs=runs), np.random.default_rng(seed)
     error = noise * random.standard_normal(along.new.shape)
     process_noise = np.zeros(len(along.new))
@@ -54,7 +54,7 @@ def selected(along, *, floor=(NOISE,), known=(False,), least=LEAST, most=2, outp
 
 
 def known(*disturbances, declared=False):
-    """A noise selected elsewhere."""
+    """Return a noise selected elsewhere."""
     return SelectedNoise(disturbances, (), (), tensor(NOISE), 0.0, (declared,))
 
 
@@ -223,7 +223,7 @@ class TestUsualSize:
         answer = disturbed_states(flow(900), np.arange(900) * STEP <= 1.02)[:, 0].max()
         assert usual_size(flow(900), 0, 1.02, np.array([0.02])) == pytest.approx(0.02 / answer, rel=1e-9)
 
-    def test_infinite_where_no_output_moves(self):
+    def test_the_usual_size_is_infinite_if_no_output_moves(self):
         assert usual_size(flow(50, ((0.0, 0.0),)), 0, 0.0, np.array([0.02])) == np.inf
 
 
@@ -272,7 +272,7 @@ class TestObserverOf:
         assert abs(correlation - np.eye(4)).max() < 4.0 / np.sqrt(3000)
         assert white[:1500].std(0) == pytest.approx(white[1500:].std(0), rel=0.1)
 
-    def test_masked_samples_have_no_gain(self):
+    def test_an_observer_has_no_gain_at_masked_samples(self):
         along = flow(20)
         along.counts[7] = 0.0
         gain = observer_of(along, (WHITE,), tensor(NOISE), RATES, OUTPUTS).gain

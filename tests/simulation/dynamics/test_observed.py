@@ -27,7 +27,7 @@ def driven(self, time, x, u, p):
 
 
 def forced_oscillator(random=1.0, **attributes):
-    """A prepared oscillator with a recorded force, and its parameters."""
+    """Return a prepared oscillator with a recorded force, and its parameters."""
     along, draws = flow(N), np.random.default_rng(0)
     force = FORCE + course(draws, along, 0.0, random)
     position = disturbed_states(along, force)[:, 0] + 0.01 * random * draws.standard_normal(N)
@@ -76,7 +76,7 @@ class TestInputHold:
         back = other.with_input_hold({"force": "linear"})
         torch.testing.assert_close(back.simulated(theta, {}), before)
 
-    def test_a_copy_s_input_hold_equals_a_declared_input_hold(self):
+    def test_the_input_hold_of_a_copy_equals_a_declared_input_hold(self):
         prepared, theta = forced_oscillator()
         declared, _ = forced_oscillator(input_hold="smooth")
         torch.testing.assert_close(
@@ -108,7 +108,7 @@ class TestObserved:
         assert float(left.std()) < 0.5 * float(prepared.residual(theta, {}).std())
         torch.testing.assert_close(corrected.residual(theta, {}), corrected.observer.whitened(left))
 
-    def test_answers_do_not_depend_on_the_trajectory_they_start_from(self):
+    def test_residuals_do_not_depend_on_the_initial_trajectory(self):
         prepared, theta = forced_oscillator()
         corrected = prepared.observed(observer_for(prepared, theta, *DISTURBANCES))
         near = corrected.answer(1.01 * theta, {}).nearby
@@ -176,7 +176,7 @@ class TestObserverInterface:
         assert torch.equal(corrected.output_disturbance(states), states[:, [2]])
         assert torch.equal(prepared.output_disturbance(states), torch.zeros(5, 1).double())
 
-    def test_the_sensor_s_contribution_is_subtracted_from_the_recording(self):
+    def test_the_contribution_of_the_sensor_is_subtracted_from_the_recording(self):
         def sensor(self, time, y, p, run):
             return {"position": y["position"] + 0.2 * time + 0.1 * y["position"] ** 2}
 

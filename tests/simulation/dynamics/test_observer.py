@@ -12,7 +12,7 @@ from mkc_torch.simulation.dynamics.observer import Disturbance, Observer, Observ
 from mkc_torch.simulation.dynamics.trajectory import Grid, marched, solve, stations, transition_matrices
 from tests.simulation.dynamics.runge_kutta import runge_kutta
 
-EVERY = 4
+INTERVALS_PER_SAMPLE = 4
 """Grid intervals between samples."""
 
 
@@ -24,7 +24,7 @@ def pendulum(x):
     return torch.stack([x[:, 1], -9.0 * torch.sin(x[:, 0]) - 0.2 * x[:, 1]], -1)
 
 
-def correcting(samples, m=1, seed=0, spread=0.05, places=(0, 1)):
+def random_correction(samples, m=1, seed=0, spread=0.05, places=(0, 1)):
     """Random gains and a random recording for a pendulum with the sine of its angle, and its speed, as outputs."""
     random = np.random.default_rng(seed)
     observer = Observer(
@@ -40,16 +40,16 @@ def correcting(samples, m=1, seed=0, spread=0.05, places=(0, 1)):
         return torch.stack([torch.sin(states[:, places[0]]), states[:, places[1]]], -1)[:, :m]
 
     measured = tensor(0.5 * random.standard_normal((samples, m)))
-    return ObserverJump(observer, EVERY * torch.arange(samples), places, measured, predict)
+    return ObserverJump(observer, INTERVALS_PER_SAMPLE * torch.arange(samples), places, measured, predict)
 
 
 def grid_of(samples, end=2.0):
-    """The grid of a single trajectory with this number of samples."""
-    time = torch.linspace(0.0, end, EVERY * (samples - 1) + 1, dtype=torch.float64)
+    """Return the grid of a single trajectory with this number of samples."""
+    time = torch.linspace(0.0, end, INTERVALS_PER_SAMPLE * (samples - 1) + 1, dtype=torch.float64)
     return Grid(time, torch.arange(len(time)) == 0)
 
 
-def by_steps(rate, jump, begin, grid):
+def stepwise_states(rate, jump, begin, grid):
     """States just before each grid time, integrated and corrected sample by sample."""
     gain, spread = jump.observer.gain.numpy(), jump.observer.spread.numpy()
     state, time, found = np.asarray(begin, dtype=float), grid.time.numpy(), []
@@ -73,8 +73,8 @@ def numpy_pendulum(_, y):
 
 @pytest.mark.parametrize("m", [1, 2])
 def test_a_trajectory_with_jumps_matches_stepwise_integration_with_corrections(m):
-    grid, jump, begin = grid_of(41), correcting(41, m), [0.8, -0.3]
-    expected = by_steps(numpy_pendulum, jump, begin, grid)
+    grid, jump, begin = grid_of(41), random_correction(41, m), [0.8, -0.3]
+    expected = stepwise_states(numpy_pendulum, jump, begin, grid)
     found = solve(pendulum, grid, tensor([begin]), tensor(expected) + 0.05, jump=jump)
     assert found.converged
     np.testing.assert_allclose(found.states.numpy(), expected, atol=2e-5)
@@ -83,7 +83,7 @@ def test_a_trajectory_with_jumps_matches_stepwise_integration_with_corrections(m
 
 
 def test_intervals_start_from_the_corrected_states():
-    grid, jump = grid_of(11), correcting(11)
+    grid, jump = grid_of(11), random_correction(11)
     states = solve(pendulum, grid, tensor([[0.8, -0.3]]), torch.zeros(len(grid.time), 2).double(), jump=jump).states
     step = grid.step.unsqueeze(-1)
     torch.testing.assert_close(stations(pendulum, states, step, jump)[::3], jump.applied(states)[:-1])
@@ -91,14 +91,14 @@ def test_intervals_start_from_the_corrected_states():
 
 
 def test_a_growing_horizon_converges_from_a_far_guess():
-    grid, jump, begin = grid_of(41), correcting(41), [0.8, -0.3]
+    grid, jump, begin = grid_of(41), random_correction(41), [0.8, -0.3]
     far = torch.full((len(grid.time), 2), 30.0).double()
     rough = marched(pendulum, grid, tensor([begin]), far, jump=jump)
-    np.testing.assert_allclose(rough.numpy(), by_steps(numpy_pendulum, jump, begin, grid), atol=1e-2)
+    np.testing.assert_allclose(rough.numpy(), stepwise_states(numpy_pendulum, jump, begin, grid), atol=1e-2)
 
 
 def test_trajectories_with_jumps_are_independent():
-    both = [correcting(11, seed=seed) for seed in range(2)]
+    both = [random_correction(11, seed=seed) for seed in range(2)]
     grid = grid_of(11)
     alone = [
         solve(pendulum, grid, tensor([[0.5, 0.2]]), torch.zeros(41, 2).double(), jump=jump).states for jump in both
@@ -127,7 +127,7 @@ def test_trajectories_with_jumps_are_independent():
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_derivatives_with_jumps_match_finite_differences(mode):
     """By parameters of the rate, the initial states, the prediction and the recording."""
-    grid, plain = grid_of(21), correcting(21, 2)
+    grid, plain = grid_of(21), random_correction(21, 2)
 
     def states(theta):
         def predict(x):
@@ -150,21 +150,21 @@ def test_derivatives_with_jumps_match_finite_differences(mode):
 @settings(max_examples=25, deadline=None, derandomize=True)
 def test_the_slope_of_a_jump_matches_finite_differences(seed, m, spread, more):
     """States without gains, and grid times without samples, are unchanged."""
-    jump = correcting(4, m, seed, spread, places=(more, 1 + more))
+    jump = random_correction(4, m, seed, spread, places=(more, 1 + more))
     n = 3 + more
-    states = tensor(np.random.default_rng(seed).standard_normal((EVERY * 3 + 1, n)))
+    states = tensor(np.random.default_rng(seed).standard_normal((INTERVALS_PER_SAMPLE * 3 + 1, n)))
     slope = jump.slope(states)
     for k, direction in enumerate(1e-6 * torch.eye(n, dtype=torch.float64)):
         difference = (jump.applied(states + direction) - jump.applied(states - direction)) / 2e-6
         torch.testing.assert_close(slope[..., k], difference, rtol=1e-5, atol=1e-7)
-    elsewhere = torch.arange(len(states)) % EVERY > 0
+    elsewhere = torch.arange(len(states)) % INTERVALS_PER_SAMPLE > 0
     assert torch.equal(jump.applied(states)[elsewhere], states[elsewhere])
     assert torch.equal(slope[elsewhere], torch.eye(n).double().expand(int(elsewhere.sum()), n, n))
     assert torch.equal(jump.applied(states)[:, 2 + more :], states[:, 2 + more :])
 
 
 def test_transitions_start_from_the_states_after_the_jump():
-    grid, jump = grid_of(6), correcting(6)
+    grid, jump = grid_of(6), random_correction(6)
     states = solve(pendulum, grid, tensor([[0.8, 0.0]]), torch.zeros(21, 2).double(), jump=jump).states
     A, _ = transition_matrices(pendulum, states, grid.step.unsqueeze(-1), jump)
     expected = []

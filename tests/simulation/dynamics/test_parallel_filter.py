@@ -9,7 +9,7 @@ from mkc_torch.simulation.dynamics import parallel_filter
 from mkc_torch.simulation.dynamics.kalman import filtered
 from mkc_torch.simulation.dynamics.parallel_filter import filtered_whole
 from tests.simulation.dynamics.oscillating import course, disturbed_states, flow, with_residual
-from tests.simulation.dynamics.test_kalman import BOTH, MODELS, model, together
+from tests.simulation.dynamics.test_kalman import MODELS, TWO_OUTPUTS, batch, model
 
 
 @pytest.fixture(autouse=True)
@@ -19,7 +19,7 @@ def without_machine_code(monkeypatch):
 
 
 def recorded(along, outliers=0.05, seed=0):
-    """A flow with process noise of its speed, outliers, and masked samples."""
+    """Return a flow with process noise of its speed, outliers, and masked samples."""
     random = np.random.default_rng(seed)
     noise = 0.1 * random.standard_normal(along.new.shape)
     noise[random.random(along.new.shape) < outliers] += 5.0
@@ -28,7 +28,7 @@ def recorded(along, outliers=0.05, seed=0):
     return replace(along, shift=0.01 * random.standard_normal(along.shift.shape))
 
 
-def alike(found, reference):
+def assert_alike(found, reference):
     for name in ("standard", "log_spread", "prior", "state", "after", "posterior"):
         expected = getattr(reference, name)
         if not expected.size:
@@ -42,17 +42,17 @@ def alike(found, reference):
 @pytest.mark.parametrize("name", [*MODELS, "several"])
 @pytest.mark.parametrize(("count", "runs"), [(1500, 1), (457, 3), (301, 1), (20, 80)])
 def test_parallel_stretches_equal_a_single_stretch(name, count, runs, monkeypatch):
-    models = together(MODELS["white process"], model(white=4.0)) if name == "several" else MODELS[name]
+    models = batch(MODELS["white process"], model(white=4.0)) if name == "several" else MODELS[name]
     along = recorded(flow(count, runs=runs))
     expected = filtered(along.whole, models, keep=True)
     if count * runs > 1200:
         # in stretches, without the fallback to a single stretch
         monkeypatch.setattr(parallel_filter, "filtered", None)
-    alike(filtered_whole(along, models, keep=True), expected)
+    assert_alike(filtered_whole(along, models, keep=True), expected)
 
 
 def test_several_outputs_and_an_undisturbed_state(monkeypatch):
-    along = recorded(flow(1400, BOTH))
+    along = recorded(flow(1400, TWO_OUTPUTS))
     # the second state is observed and undisturbed
     transition = along.transition.copy()
     transition[:, 1, 0] = 0.0
@@ -62,29 +62,29 @@ def test_several_outputs_and_an_undisturbed_state(monkeypatch):
     assert not expected.prior[..., 1, 1].any()
     assert np.abs(expected.state[..., 1]).max() > 0.01
     monkeypatch.setattr(parallel_filter, "filtered", None)
-    alike(filtered_whole(along, models, keep=True), expected)
+    assert_alike(filtered_whole(along, models, keep=True), expected)
 
 
-def unseen(count):
-    """A flow without unmasked samples; its states never decay."""
+def unobserved_flow(count):
+    """Return a flow without unmasked samples; its states never decay."""
     along = recorded(flow(count))
     return replace(along, counts=np.zeros_like(along.counts), transition=along.transition * 0.0 + np.eye(2))
 
 
 def test_unobserved_states_are_passed_from_stretch_to_stretch(monkeypatch):
-    along = unseen(1400)
+    along = unobserved_flow(1400)
     expected = filtered(along.whole, MODELS["white process"], keep=True)
     monkeypatch.setattr(parallel_filter, "filtered", None)
-    alike(filtered_whole(along, MODELS["white process"], keep=True), expected)
+    assert_alike(filtered_whole(along, MODELS["white process"], keep=True), expected)
 
 
 def test_a_single_stretch_is_the_fallback_without_convergence(monkeypatch):
-    along, calls = unseen(1400), []
+    along, calls = unobserved_flow(1400), []
     monkeypatch.setattr(parallel_filter, "_MOST_ROUNDS", 1)
     monkeypatch.setattr(
         parallel_filter, "filtered", lambda *args, **kwargs: calls.append(1) or filtered(*args, **kwargs)
     )
-    alike(filtered_whole(along, MODELS["white process"]), filtered(along.whole, MODELS["white process"]))
+    assert_alike(filtered_whole(along, MODELS["white process"]), filtered(along.whole, MODELS["white process"]))
     assert calls == [1]
 
 
@@ -96,7 +96,7 @@ def test_states_are_empty_unless_kept():
 
 @pytest.mark.parametrize("name", [*MODELS, "several"])
 def test_runs_are_filtered_in_parallel(name, monkeypatch):
-    models = together(MODELS["white process"], model(white=4.0)) if name == "several" else MODELS[name]
+    models = batch(MODELS["white process"], model(white=4.0)) if name == "several" else MODELS[name]
     along, cut = recorded(flow(150, runs=4)), 40
     between = ("transition", "noise_input", "shift", "step")
     along = replace(along, shift=np.where(along.step[:, None] > 0, along.shift, 0.0))
@@ -109,7 +109,7 @@ def test_runs_are_filtered_in_parallel(name, monkeypatch):
         return filtered(parts, *args, **kwargs)
 
     monkeypatch.setattr(parallel_filter, "filtered", counted)
-    alike(filtered_whole(along, models, keep=True), expected)
+    assert_alike(filtered_whole(along, models, keep=True), expected)
     assert steps == [(150, 4)] or not (models.white.any() or models.place.shape[1])
 
 

@@ -28,7 +28,7 @@ class House(Dynamics):
 
 
 def house(decimals=2):
-    """A room that cools under unrecorded random heating, rounded to a few decimals."""
+    """Return a room that cools under unrecorded random heating, rounded to a few decimals."""
     g = torch.Generator().manual_seed(0)
     time = torch.arange(300, dtype=torch.float64)
     heating, indoor, now = 0.0, [], 20.0

@@ -1,4 +1,4 @@
-"""The input that a state acts relative to is found by the equations, not by chance values of the parameters."""
+"""The surroundings of a state: the input relative to which it acts, by the form of the equations."""
 
 import pytest
 
@@ -21,11 +21,11 @@ class Heater(Dynamics):
 
 
 @pytest.mark.parametrize("friction", [1.0, 0.7, Parameter(1.0, lower=0.0)])
-def test_a_force_is_no_surroundings_whatever_the_friction(friction):
+def test_a_force_is_not_the_surroundings_at_any_friction(friction):
     system = type("Sled", (Sled,), {"parameters": {"mass": 4.0, "friction": friction}})()
     assert surroundings(system) == {}
 
 
 @pytest.mark.parametrize("loss", [1.0, 0.1, 0.0])
-def test_an_ambient_temperature_is_the_surroundings_whatever_the_loss(loss):
+def test_an_ambient_temperature_is_the_surroundings_at_any_loss(loss):
     assert surroundings(type("Heater", (Heater,), {"parameters": {"loss": loss}})()) == {"temp": "outside"}

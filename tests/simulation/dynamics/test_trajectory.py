@@ -18,13 +18,13 @@ def van_der_pol(x):
     return torch.stack([x[:, 1], 3.0 * (1.0 - x[:, 0] ** 2) * x[:, 1] - x[:, 0]], -1)
 
 
-def rubbing(x):
-    """A mass on a spring with friction that is nearly a jump."""
+def mass_with_friction(x):
+    """Return the rate of a mass on a spring with friction that is nearly a jump."""
     return torch.stack([x[:, 1], -x[:, 0] - 0.2 * torch.tanh(x[:, 1] / 0.001)], -1)
 
 
 def reference(rate, start, time):
-    """The trajectory by scipy at the given times."""
+    """Return the trajectory by scipy at the given times."""
 
     def at(_, y):
         return rate(torch.from_numpy(y).unsqueeze(0))[0].numpy()
@@ -34,30 +34,30 @@ def reference(rate, start, time):
     return torch.from_numpy(found.y.T.copy())
 
 
-def near(states, spread, seed=0):
-    """A guess: the states with normal errors of this share of their size."""
+def perturbed(states, spread, seed=0):
+    """Return a guess: the states with normal errors of this share of their size."""
     generator = torch.Generator().manual_seed(seed)
     return states + spread * states.abs().amax(0) * torch.randn(states.shape, generator=generator, dtype=states.dtype)
 
 
 def grid_of(time):
-    """The grid of a single trajectory."""
+    """Return the grid of a single trajectory."""
     return Grid(time, torch.arange(len(time)) == 0)
 
 
-def even(end, count):
+def even_times(end, count):
     return torch.linspace(0.0, end, count, dtype=torch.float64)
 
 
 @pytest.mark.parametrize(
     ("rate", "end", "count", "within"),
-    [(pendulum, 10.0, 401, 5e-6), (van_der_pol, 20.0, 1601, 1e-5), (rubbing, 10.0, 2001, 1e-4)],
+    [(pendulum, 10.0, 401, 5e-6), (van_der_pol, 20.0, 1601, 1e-5), (mass_with_friction, 10.0, 2001, 1e-4)],
     ids=["pendulum", "van der Pol", "stiff friction"],
 )
 def test_trajectories_match_an_adaptive_integrator(rate, end, count, within):
-    time = even(end, count)
+    time = even_times(end, count)
     expected = reference(rate, [1.0, 0.0], time.numpy())
-    found = solve(rate, grid_of(time), expected[:1], near(expected, 0.01))
+    found = solve(rate, grid_of(time), expected[:1], perturbed(expected, 0.01))
     assert found.converged
     assert float((found.states - expected).abs().max()) < within
 
@@ -65,7 +65,7 @@ def test_trajectories_match_an_adaptive_integrator(rate, end, count, within):
 def test_the_error_is_of_fourth_order():
     errors = []
     for count in (101, 201, 401):
-        time = even(10.0, count)
+        time = even_times(10.0, count)
         expected = reference(pendulum, [1.0, 0.0], time.numpy())
         errors.append(float((solve(pendulum, grid_of(time), expected[:1], expected).states - expected).abs().max()))
     ratios = np.array(errors[:-1]) / errors[1:]
@@ -77,7 +77,7 @@ def test_irregular_steps_are_accurate():
     generator = torch.Generator().manual_seed(1)
     time = (0.005 + 0.04 * torch.rand(400, generator=generator, dtype=torch.float64)).cumsum(0)
     expected = reference(pendulum, [1.0, 0.5], time.numpy())
-    found = solve(pendulum, grid_of(time), expected[:1], near(expected, 0.05))
+    found = solve(pendulum, grid_of(time), expected[:1], perturbed(expected, 0.05))
     assert found.converged
     assert float((found.states - expected).abs().max()) < 2e-5
 
@@ -101,21 +101,21 @@ def test_rates_that_are_cubics_of_time_are_integrated_exactly(coefficients, step
 
 
 def test_stiff_decay_stays_bounded_at_steps_far_beyond_its_time_constant():
-    time = even(10.0, 11)
+    time = even_times(10.0, 11)
     found = solve(lambda x: -1e6 * (x - 1.0), grid_of(time), torch.ones(1, 1).double(), torch.zeros(11, 1).double())
     assert found.converged
     torch.testing.assert_close(found.states, torch.ones(11, 1).double())
 
 
 @pytest.fixture
-def several():
+def trajectories():
     """Trajectories of different length: their grid, initial states, guesses, and separate solutions."""
     pieces, guesses, alone = [], [], []
     starts = torch.tensor([[1.0, 0.0], [0.2, 2.0], [-0.5, 0.3]], dtype=torch.float64)
     for count, start in zip((120, 2, 57), starts, strict=True):
-        time = even(0.02 * (count - 1), count) + 100.0 * count
+        time = even_times(0.02 * (count - 1), count) + 100.0 * count
         expected = reference(pendulum, start.numpy(), time.numpy())
-        guess = near(expected, 0.02)
+        guess = perturbed(expected, 0.02)
         pieces.append(time)
         guesses.append(guess)
         alone.append(solve(pendulum, grid_of(time), start.unsqueeze(0), guess).states)
@@ -123,16 +123,16 @@ def several():
     return Grid(torch.cat(pieces), begins), starts, torch.cat(guesses), torch.cat(alone)
 
 
-def test_trajectories_in_a_grid_are_independent(several):
-    grid, starts, guess, alone = several
+def test_trajectories_in_a_grid_are_independent(trajectories):
+    grid, starts, guess, alone = trajectories
     found = solve(pendulum, grid, starts, guess)
     assert found.converged
     assert grid.longest == 120
     torch.testing.assert_close(found.states, alone, rtol=1e-9, atol=1e-10)
 
 
-def test_derivatives_by_other_trajectories_are_0(several):
-    grid, starts, guess, _ = several
+def test_derivatives_by_other_trajectories_are_0(trajectories):
+    grid, starts, guess, _ = trajectories
     slope = torch.func.jacfwd(lambda begin: solve(pendulum, grid, begin, guess).states)(starts)
     own = grid.begins.long().cumsum(0) - 1
     for k in range(3):
@@ -150,7 +150,7 @@ def test_a_single_interval_is_solved():
 
 
 def test_stations_lie_on_the_trajectory():
-    time = even(4.0, 201)
+    time = even_times(4.0, 201)
     expected = reference(pendulum, [1.0, 0.0], time.numpy())
     found = solve(pendulum, grid_of(time), expected[:1], expected)
     found_between = stations(pendulum, found.states, grid_of(time).step.unsqueeze(-1))
@@ -162,7 +162,7 @@ def test_stations_lie_on_the_trajectory():
 
 # derivatives: of a damped pendulum by its two parameters and its two first states
 
-TIME = even(3.0, 121)
+TIME = even_times(3.0, 121)
 THETA = torch.tensor([9.0, 0.3, 1.0, -0.4], dtype=torch.float64)
 
 
@@ -177,7 +177,7 @@ def damped(theta, guess=None, known=None, time=TIME):
 
 @pytest.fixture(scope="module")
 def solution():
-    """The solution at ``THETA``, from which guesses are made."""
+    """Return the solution at ``THETA``, from which guesses are made."""
 
     def rate(x):
         return torch.stack([x[:, 1], -THETA[0] * torch.sin(x[:, 0]) - THETA[1] * x[:, 1]], -1)
@@ -199,20 +199,20 @@ def differences(solution):
 class TestDerivatives:
     """Derivatives, from a near and from a far guess."""
 
-    def test_jvp(self, solution, differences, spread):
+    def test_jvp_agrees_with_finite_differences(self, solution, differences, spread):
         direction = torch.tensor([0.5, -1.0, 0.2, 0.7], dtype=torch.float64)
-        guess = near(solution, spread)
+        guess = perturbed(solution, spread)
         states, slope = torch.func.jvp(lambda t: damped(t, guess).states, (THETA,), (direction,))
         torch.testing.assert_close(slope, differences @ direction, rtol=1e-5, atol=1e-6)
         torch.testing.assert_close(states, damped(THETA, guess).states, rtol=1e-9, atol=1e-9)
 
-    def test_jacfwd(self, solution, differences, spread):
-        guess = near(solution, spread)
+    def test_jacfwd_agrees_with_finite_differences(self, solution, differences, spread):
+        guess = perturbed(solution, spread)
         slope = torch.func.jacfwd(lambda t: damped(t, guess).states)(THETA)
         torch.testing.assert_close(slope, differences, rtol=1e-5, atol=1e-6)
 
     def test_vjp_is_the_transpose(self, solution, differences, spread):
-        _, pull = torch.func.vjp(lambda t: damped(t, near(solution, spread)).states, THETA)
+        _, pull = torch.func.vjp(lambda t: damped(t, perturbed(solution, spread)).states, THETA)
         cotangents = torch.randn(3, 121, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         pulled = torch.vmap(lambda c: pull(c)[0])(cotangents)
         expected = torch.einsum("bgn,gnp->bp", cotangents, differences)
@@ -220,7 +220,7 @@ class TestDerivatives:
 
     def test_derivatives_by_the_initial_states_only(self, solution, differences, spread):
         begin = THETA[2:].clone().requires_grad_()
-        states = damped(torch.cat([THETA[:2], begin]), near(solution, spread)).states
+        states = damped(torch.cat([THETA[:2], begin]), perturbed(solution, spread)).states
         (slope,) = torch.autograd.grad(states[-1, 0], begin)
         torch.testing.assert_close(slope, differences[-1, 0, 2:], rtol=1e-5, atol=1e-6)
 
@@ -229,20 +229,20 @@ class TestDerivatives:
             return torch.stack([x[:, 1], -THETA[0] * torch.sin(x[:, 0]) - THETA[1] * x[:, 1]], -1)
 
         begin = THETA[2:].clone().requires_grad_()
-        states = solve(rate, grid_of(TIME), begin.unsqueeze(0), near(solution, spread)).states
+        states = solve(rate, grid_of(TIME), begin.unsqueeze(0), perturbed(solution, spread)).states
         (slope,) = torch.autograd.grad(states[-1, 0], begin)
         torch.testing.assert_close(slope, differences[-1, 0, 2:], rtol=1e-5, atol=1e-6)
 
 
-def test_gradcheck():
-    time = even(0.5, 11)
+def test_gradients_pass_gradcheck():
+    time = even_times(0.5, 11)
     guess = damped(THETA, torch.tensor([[1.0, -0.4]]).double().expand(11, 2), time=time).states.detach()
     theta = THETA.clone().requires_grad_()
-    assert torch.autograd.gradcheck(lambda t: damped(t, near(guess, 0.02), time=time).states, (theta,))
+    assert torch.autograd.gradcheck(lambda t: damped(t, perturbed(guess, 0.02), time=time).states, (theta,))
 
 
 def test_the_solution_does_not_depend_on_the_guess(solution):
-    found = [damped(THETA, near(solution, spread, seed)) for seed, spread in enumerate((0.0, 0.02, 0.1))]
+    found = [damped(THETA, perturbed(solution, spread, seed)) for seed, spread in enumerate((0.0, 0.02, 0.1))]
     assert all(trajectory.converged for trajectory in found)
     for other in found[1:]:
         torch.testing.assert_close(other.states, found[0].states, rtol=0.0, atol=1e-9)
@@ -275,7 +275,7 @@ def test_a_known_linearisation_saves_evaluations(solution):
 
 def test_a_branch_left_out_by_where_has_no_slope():
     """An empty tank fills: at level 0 the root's slope is infinite, but the outflow is 0."""
-    time = even(10.0, 201)
+    time = even_times(10.0, 201)
     inflow = torch.where(time > 2.0, 0.1, 0.0)
     grid = grid_of(time)
     feed = grid.spread(inflow)
@@ -293,7 +293,7 @@ def test_a_branch_left_out_by_where_has_no_slope():
 
 def test_the_graph_of_a_rate_with_parameters_survives_solving():
     """The user's loss can still be differentiated after solving with a parameter that requires a gradient."""
-    time = even(2.0, 41)
+    time = even_times(2.0, 41)
     theta = torch.tensor(9.0, dtype=torch.float64, requires_grad=True)
     begin = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
     squared = theta.square()
@@ -313,9 +313,9 @@ def test_the_graph_of_a_rate_with_parameters_survives_solving():
 
 
 def test_single_precision_is_accurate():
-    time = even(10.0, 401)
+    time = even_times(10.0, 401)
     expected = reference(pendulum, [1.0, 0.0], time.numpy())
-    found = solve(pendulum, grid_of(time.float()), expected[:1].float(), near(expected, 0.02).float())
+    found = solve(pendulum, grid_of(time.float()), expected[:1].float(), perturbed(expected, 0.02).float())
     assert found.converged
     assert found.states.dtype == torch.float32
     assert float((found.states - expected).abs().max()) < 5e-4
@@ -344,13 +344,13 @@ def test_equations_without_a_solution_fail_after_few_evaluations(rate, begin):
         return rate(x)
 
     start = torch.full((1, 1), begin, dtype=torch.float64)
-    found = solve(counted, grid_of(even(2.0, 101)), start, start.expand(101, 1))
+    found = solve(counted, grid_of(even_times(2.0, 101)), start, start.expand(101, 1))
     assert not found.converged
     assert calls < 1000
 
 
 def test_a_single_unsolved_trajectory_fails_the_whole_grid():
-    time = torch.cat([even(0.5, 26), even(2.0, 101)])
+    time = torch.cat([even_times(0.5, 26), even_times(2.0, 101)])
     begins = torch.zeros(127, dtype=torch.bool)
     begins[[0, 26]] = True
     begin = torch.ones(2, 1, dtype=torch.float64)
@@ -364,10 +364,10 @@ def test_segments_make_an_unstable_system_solvable():
     def inverted(x):
         return torch.stack([x[:, 1], 9.0 * torch.sin(x[:, 0])], -1)
 
-    time = even(5.0, 501)
+    time = even_times(5.0, 501)
     expected = reference(inverted, [1e-3, 0.0], time.numpy())
     begins = torch.arange(501) % 50 == 0
     for parts in (begins, torch.arange(501) == 0):
-        found = solve(inverted, Grid(time, parts), expected[parts] + 1e-3, near(expected, 0.01))
+        found = solve(inverted, Grid(time, parts), expected[parts] + 1e-3, perturbed(expected, 0.01))
         away = float((found.states - expected).abs().max() / expected.abs().max())
         assert (found.converged and away < 0.05) == (parts is begins)

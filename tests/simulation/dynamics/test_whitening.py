@@ -27,7 +27,7 @@ MODELS = FilterModels(
 
 
 def oscillator(N=60, runs=1, seed=0):
-    """An oscillator with known states at the start of each run, and its first state measured."""
+    """Return an oscillator with known states at the start of each run, and its first state measured."""
     random = np.random.default_rng(seed)
     A = np.array([[1.0, STEP], [-0.4 * STEP, 0.97]])
     transition = np.broadcast_to(A, (N - 1, 2, 2)).copy()

@@ -96,7 +96,7 @@ def description(
     fmi: str | None = None,
     without: Sequence[str] = (),
 ) -> str:
-    """The modelDescription.xml, without the variables named in ``without``."""
+    """Return the modelDescription.xml, without the variables named in ``without``."""
     real = "Real" if version == 2 else "Float64"
     variables = [("time", 0, "independent", "continuous", "", None, ("", "", ""))]
     for k, name in enumerate(model.states):
@@ -151,7 +151,7 @@ def description(
 
 def _structure(model: Model, version: int, place: Mapping[str, int]) -> str:
     def depends(text: str) -> str:
-        """The attribute ``dependencies``: the time, states and inputs in an equation."""
+        """Return the attribute ``dependencies``: the time, states and inputs in an equation."""
         words = set(re.findall(r"[A-Za-z_]\w*", text))
         by = [name for name in ("time", *model.states, *model.inputs) if name in words or model.events]
         kinds = {"time": 0} | {name: STATES + k for k, name in enumerate(model.states)}
@@ -178,7 +178,7 @@ def _structure(model: Model, version: int, place: Mapping[str, int]) -> str:
 
 
 def source(model: Model, version: int, *, derivatives: bool = True) -> str:
-    """The C source."""
+    """Return the C source."""
     import sympy
     from sympy.parsing.sympy_parser import parse_expr
 
@@ -246,7 +246,7 @@ def _stubs(own: str, version: int) -> str:
 
 
 def with_memory(model: Model) -> Model:
-    """The model with a memory: the number of events changes its first rate."""
+    """Return the model with a memory: the number of events changes its first rate."""
     return replace(model, memory=True)
 
 

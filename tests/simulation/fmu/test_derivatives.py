@@ -54,7 +54,7 @@ MODELS = (PENDULUM, MOTOR, TANKS, HEATER, CART)
 KINDS = ((2, True), (2, False), (3, True), (3, False))
 
 
-def moments(model, rows=6):
+def sample_points(model, rows=6):
     g = torch.Generator().manual_seed(3)
     time, states, inputs = (
         torch.rand(rows, count, generator=g, dtype=torch.float64) + 0.2
@@ -96,7 +96,7 @@ def fmus(request, tmp_path_factory):
 @pytest.mark.parametrize(("model", "outputs"), [*((model, False) for model in MODELS), (MOTOR, True)])
 def test_values_and_derivatives_equal_the_equations(fmus, model, outputs):
     texts = list((model.outputs if outputs else model.rates).values())
-    evaluation, at = fmus[model.name], moments(model)
+    evaluation, at = fmus[model.name], sample_points(model)
     values, slopes = by_sympy(model, texts, at)
 
     def function(*parts):
@@ -112,7 +112,7 @@ def test_values_and_derivatives_equal_the_equations(fmus, model, outputs):
 
 
 def test_batches_equal_single_evaluations(fmus):
-    evaluation, (time, states, inputs, parameters) = fmus["Pendulum"], moments(PENDULUM)
+    evaluation, (time, states, inputs, parameters) = fmus["Pendulum"], sample_points(PENDULUM)
 
     def function(states, parameters):
         return evaluated(evaluation, False, time, states, inputs, parameters)
@@ -128,7 +128,7 @@ def test_batches_equal_single_evaluations(fmus):
 
 
 def test_reverse_mode_applied_twice_is_used_and_second_derivatives_are_refused(fmus):
-    evaluation, (time, states, inputs, parameters) = fmus["Cart"], moments(CART)
+    evaluation, (time, states, inputs, parameters) = fmus["Cart"], sample_points(CART)
 
     def function(parameters):
         return evaluated(evaluation, False, time, states, inputs, parameters)
@@ -149,7 +149,7 @@ def test_a_wrong_derivative_of_the_fmu_is_not_used(tmp_path):
     evaluation = load_fmu(wrong).evaluation
     plain = evaluation.binary.slopes
     evaluation.binary.slopes = lambda *how: 1.01 * plain(*how)
-    at = moments(PENDULUM)
+    at = sample_points(PENDULUM)
     _, (expected, _, _) = by_sympy(PENDULUM, list(PENDULUM.rates.values()), at)
     found = evaluation.slopes(False, EvaluationPoints(*(part.numpy() for part in at)), "states")
     np.testing.assert_allclose(found, expected, rtol=1e-8)
@@ -157,7 +157,7 @@ def test_a_wrong_derivative_of_the_fmu_is_not_used(tmp_path):
 
 
 def test_repeated_points_are_computed_once(fmus, monkeypatch):
-    evaluation, (time, states, inputs, parameters) = fmus["Motor"], moments(MOTOR)
+    evaluation, (time, states, inputs, parameters) = fmus["Motor"], sample_points(MOTOR)
     computed = []
     plain = evaluation.binary.values
     monkeypatch.setattr(evaluation.binary, "values", lambda *how: computed.append(len(how[1])) or plain(*how))

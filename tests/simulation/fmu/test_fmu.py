@@ -28,14 +28,14 @@ class Pendulum(Dynamics):
         return {"angle": x.speed, "speed": u.torque - p.stiffness * torch.sin(x.angle) - p.damping * x.speed}
 
 
-def swing(count=60, **renamed):
+def pendulum_recording(count=60, **renamed):
     time = 0.05 * torch.arange(count, dtype=torch.float64)
     columns = {"time": time, "torque": torch.sin(2.0 * time), "angle": 0.4 * torch.cos(3.0 * time)}
     return Recording({renamed.get(name, name): values for name, values in columns.items()})
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_description_is_read(tmp_path, version):
+def test_the_description_gives_states_inputs_outputs_and_parameters(tmp_path, version):
     simulation = load_simulation(str(make_fmu(tmp_path / "p.fmu", PENDULUM, version)))
     assert (simulation.name, simulation.states, simulation.inputs) == ("Pendulum", ("angle", "speed"), ("torque",))
     assert simulation.units == {"angle": "rad", "speed": "rad/s", "torque": "N·m"}
@@ -46,7 +46,7 @@ def test_description_is_read(tmp_path, version):
 @pytest.mark.parametrize(("version", "derivatives"), [(2, True), (2, False), (3, True)])
 def test_residual_equals_the_same_equations_in_torch(tmp_path, version, derivatives):
     simulation = load_fmu(make_fmu(tmp_path / "p.fmu", PENDULUM, version, derivatives=derivatives))
-    fmu, expected = simulation.prepare(swing()), Pendulum().prepare(swing())
+    fmu, expected = simulation.prepare(pendulum_recording()), Pendulum().prepare(pendulum_recording())
     theta = expected.start()
     assert fmu.parameter_names == expected.parameter_names
     assert fmu.kinematic == {"angle": "speed"}
@@ -61,10 +61,10 @@ def test_a_state_has_the_name_of_the_output_that_equals_it(tmp_path):
     simulation = load_fmu(make_fmu(tmp_path / "p.fmu", model))
     assert simulation.states == ("load_phi", "speed")
     # a column may have the name in the FMU
-    prepared = simulation.prepare(swing(angle="load.phi"))
+    prepared = simulation.prepare(pendulum_recording(angle="load.phi"))
     assert prepared.channels == ("load_phi",)
-    assert torch.equal(prepared.guess[prepared.rows][:, 0], swing()["angle"])
-    raised = simulation.prepare(swing(angle="height"))
+    assert torch.equal(prepared.guess[prepared.rows][:, 0], pendulum_recording()["angle"])
+    raised = simulation.prepare(pendulum_recording(angle="height"))
     assert raised.channels == ("height",)
     states = torch.tensor([[0.3, 0.1]], dtype=torch.float64).expand(60, 2)
     x = type("X", (), {"load_phi": states[:, 0], "speed": states[:, 1]})()
@@ -82,18 +82,21 @@ def test_the_error_lists_outputs_and_columns(tmp_path):
     with pytest.raises(
         SimulationError, match=r"It has body\.height, angle, speed; the recording has time, torque, phi"
     ):
-        simulation.prepare(swing(angle="phi"))
+        simulation.prepare(pendulum_recording(angle="phi"))
 
 
 def test_an_fmu_can_be_pickled(tmp_path):
     simulation = load_fmu(make_fmu(tmp_path / "p.fmu", PENDULUM))
     again = pickle.loads(pickle.dumps(simulation))
     assert again.states == simulation.states
-    theta = Pendulum().prepare(swing()).start()
-    assert torch.equal(again.prepare(swing()).residual(theta, {}), simulation.prepare(swing()).residual(theta, {}))
+    theta = Pendulum().prepare(pendulum_recording()).start()
+    assert torch.equal(
+        again.prepare(pendulum_recording()).residual(theta, {}),
+        simulation.prepare(pendulum_recording()).residual(theta, {}),
+    )
 
 
-STOP = Model(
+SPILLWAY = Model(
     "Stop",
     {"level": "inflow - loss*level - r0*spill*(level - rim)"},
     {"loss": (0.3, 0.0, None, "1/s"), "spill": (2.0, None, None, ""), "rim": (0.5, None, None, "")},
@@ -105,24 +108,24 @@ STOP = Model(
 
 @pytest.mark.parametrize("version", [2, 3])
 def test_discrete_equations_are_solved_at_each_moment(tmp_path, version):
-    simulation = load_fmu(make_fmu(tmp_path / "s.fmu", STOP, version))
+    simulation = load_fmu(make_fmu(tmp_path / "s.fmu", SPILLWAY, version))
     level = torch.tensor([0.2, 0.9, 0.3, 0.7], dtype=torch.float64)
     x, u = type("X", (), {"level": level})(), type("U", (), {"inflow": torch.zeros_like(level)})()
-    p = type("P", (), {name: torch.tensor(start).double() for name, (start, *_) in STOP.parameters.items()})()
+    p = type("P", (), {name: torch.tensor(start).double() for name, (start, *_) in SPILLWAY.parameters.items()})()
     found = simulation.derivative(torch.zeros_like(level), x, u, p)["level"]
     torch.testing.assert_close(found, -0.3 * level - 2.0 * (level - 0.5).clamp(min=0.0))
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_jumps_and_memory_are_refused(tmp_path, version):
-    bouncing = replace(STOP, reset={"level": "-0.8*level"})
+def test_fmus_with_state_resets_or_memory_are_refused(tmp_path, version):
+    bouncing = replace(SPILLWAY, reset={"level": "-0.8*level"})
     with pytest.raises(SimulationError, match=r"resets its states at an event.*`--simulator-output SIM.csv`"):
         load_fmu(make_fmu(tmp_path / "b.fmu", bouncing, version))
     with pytest.raises(FmuError, match=r"depend on earlier events.*`--simulator-output SIM.csv`"):
-        load_fmu(make_fmu(tmp_path / "m.fmu", replace(STOP, memory=True), version))
+        load_fmu(make_fmu(tmp_path / "m.fmu", replace(SPILLWAY, memory=True), version))
 
 
-def zipped(path, text, *more):
+def write_fmu(path, text, *more):
     with zipfile.ZipFile(path, "w") as archive:
         if text is not None:
             archive.writestr("modelDescription.xml", text)
@@ -130,8 +133,8 @@ def zipped(path, text, *more):
             archive.writestr(name, "")
 
 
-TEXT = description(PENDULUM)
-STILL = Model("Still", {}, {"gain": (1.0, None, None, "")}, ("torque",), {"force": "gain*torque"})
+DESCRIPTION = description(PENDULUM)
+STATIC_MODEL = Model("Still", {}, {"gain": (1.0, None, None, "")}, ("torque",), {"force": "gain*torque"})
 
 
 @pytest.mark.parametrize(
@@ -142,19 +145,19 @@ STILL = Model("Still", {}, {"gain": (1.0, None, None, "")}, ("torque",), {"force
         (description(PENDULUM, fmi="1.0"), (), "this FMU is of FMI 1.0; FMI 2.0 and 3.0 are read"),
         ("<model/>", (), "this FMU is of FMI (no version)"),
         (description(PENDULUM, 3, kind="ScheduledExecution"), (), "for scheduled execution only; export it for model"),
-        (description(STILL), (), "no continuous states, so there is no differential equation in it"),
-        (TEXT.replace("start=\"9.0\"", ""), (), "its parameter stiffness has no start, which FMI requires"),
-        (TEXT.replace("start=\"9.0\"", "start=\"nine\""), (), "its parameter stiffness has the value 'nine'"),
-        (TEXT.replace("start=\"0.1\"", "start=\"-0.1\""), (), "its parameter damping cannot be fitted"),
-        (TEXT, (), "it has no binaries, and none for"),
-        (TEXT, ("binaries/mars64/Pendulum.so",), "it has binaries for mars64 only, and none for"),
-        (TEXT, ("sources/all.c",), "it contains sources; compile them with `fmpy compile MODEL.fmu`"),
-        (TEXT, ("binaries/PLATFORM/Pendulum.so",), "its binary cannot be used"),
+        (description(STATIC_MODEL), (), "no continuous states, so there is no differential equation in it"),
+        (DESCRIPTION.replace("start=\"9.0\"", ""), (), "its parameter stiffness has no start, which FMI requires"),
+        (DESCRIPTION.replace("start=\"9.0\"", "start=\"nine\""), (), "its parameter stiffness has the value 'nine'"),
+        (DESCRIPTION.replace("start=\"0.1\"", "start=\"-0.1\""), (), "its parameter damping cannot be fitted"),
+        (DESCRIPTION, (), "it has no binaries, and none for"),
+        (DESCRIPTION, ("binaries/mars64/Pendulum.so",), "it has binaries for mars64 only, and none for"),
+        (DESCRIPTION, ("sources/all.c",), "it contains sources; compile them with `fmpy compile MODEL.fmu`"),
+        (DESCRIPTION, ("binaries/PLATFORM/Pendulum.so",), "its binary cannot be used"),
     ],
 )  # fmt: skip
-def test_unusable_fmus_are_refused_with_a_sentence(tmp_path, text, more, words):
+def test_unusable_fmus_are_refused_with_the_reason(tmp_path, text, more, words):
     path = tmp_path / "model.fmu"
-    zipped(path, text, *(name.replace("PLATFORM", binary._platform(2)) for name in more))
+    write_fmu(path, text, *(name.replace("PLATFORM", binary._platform(2)) for name in more))
     with pytest.raises(FmuError) as caught:
         load_fmu(path)
     message = str(caught.value)
@@ -196,7 +199,7 @@ class Lag(Fmi2Slave):
 """
 
 
-def test_co_simulation_is_compared_like_a_simulators_output(tmp_path):
+def test_a_co_simulation_fmu_is_compared_like_a_simulator_output(tmp_path):
     builder = pytest.importorskip("pythonfmu.builder")
     (tmp_path / "lag.py").write_text(COSIMULATION, encoding="utf-8")
     path = builder.FmuBuilder.build_FMU(str(tmp_path / "lag.py"), dest=str(tmp_path))

@@ -36,7 +36,7 @@ def test_the_fmus_have_the_nominal_equations(tmp_path, system):
 
 
 @pytest.mark.slow
-def test_findings_are_the_same(monkeypatch):
+def test_the_diagnosis_of_an_fmu_equals_that_of_its_equations(monkeypatch):
     """A throw, the fastest of the systems; `python -m tests.benchmarks.fmu` runs all systems."""
     monkeypatch.setattr(fmu, "FIRST", 18)
     (pair,) = fmu.pairs(1)

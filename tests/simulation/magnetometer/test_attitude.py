@@ -14,8 +14,8 @@ from tests.simulation.tumbling import FIELD, OFFSET, changed, full_truth, true_m
 DIRECTION = FIELD / np.linalg.norm(FIELD)
 
 
-def exact(view):
-    """The parameters with zero residual, by SciPy from the view's start."""
+def zero_residual_parameters(view):
+    """Return the parameters with zero residual, by SciPy from the view's start."""
     found = least_squares(
         lambda theta: view.residual(torch.from_numpy(theta), {}).numpy().ravel(),
         view.start().numpy(), xtol=1e-15, ftol=1e-15, gtol=1e-15,
@@ -30,7 +30,7 @@ def view():
 
 @pytest.fixture(scope="module")
 def truth(view):
-    return exact(view)
+    return zero_residual_parameters(view)
 
 
 def test_residual_is_zero_at_the_truth(view, truth):
@@ -62,7 +62,7 @@ def test_channels_are_orthonormal_and_the_first_is_along_the_field(view, truth):
 
 
 def truth_of(view, changes):
-    """The true parameters; the tilt of the field relative to the view's start is fitted."""
+    """Return the true parameters; the tilt of the field relative to the view's start is fitted."""
 
     def left(tilt):
         return view.residual(full_truth(view.strength, *tilt), changes).numpy().ravel()
@@ -117,7 +117,7 @@ def test_the_start_finds_the_field_of_a_sensor_without_soft_iron():
     assert view.strength == pytest.approx(np.linalg.norm(FIELD))
 
 
-def test_prior_of_the_matrix(view):
+def test_the_prior_is_on_the_matrix_only(view):
     precision = view.prior.precision
     assert bool((precision[3:12] > 0).all())
     assert bool((precision[:3] == 0).all())
@@ -125,7 +125,7 @@ def test_prior_of_the_matrix(view):
     assert torch.equal(view.prior.mean[3:12].reshape(3, 3), torch.eye(3, dtype=torch.float64))
 
 
-def test_ports(view):
+def test_ports_are_the_field_vector_and_the_sensor(view):
     assert view.ports["field"].channels == ("east", "north", "up")
     assert view.ports["sensor"].channels == ("x", "y", "z")
     assert all(port.pointwise for port in view.ports.values())
@@ -162,13 +162,13 @@ def test_a_vehicle_that_hardly_tilts_has_a_warning():
     assert Magnetometer().prepare(tumbling(500, noise=0.3, attitude=True)).warnings == ()
 
 
-def inverse(recording):
+def with_inverse_attitude(recording):
     return changed(recording, **{name: -recording[name] for name in ("q_x", "q_y", "q_z")})
 
 
 def test_an_inverse_attitude_is_refused_with_the_remedy():
     with pytest.raises(RecordingError, match=r"quaternions are the inverse.*give the conjugate"):
-        Magnetometer().prepare(inverse(tumbling(500, noise=0.3, attitude=True)))
+        Magnetometer().prepare(with_inverse_attitude(tumbling(500, noise=0.3, attitude=True)))
 
 
 def test_an_unrelated_attitude_has_a_warning():

@@ -28,12 +28,12 @@ def rates(rate):
     return {f"gyro_{axis}": np.ascontiguousarray(column) for axis, column in zip("xyz", rate.T, strict=True)}
 
 
-def prepared(attitude, **further):
+def view_of(attitude, **further):
     return Magnetometer().prepare(changed(tumbling(N, noise=0.5, **further), **attitude))
 
 
-def drifting(degrees, tau=10.0):
-    """A rotation error with the correlation time of a filter."""
+def drifting_rotation(degrees, tau=10.0):
+    """Return a rotation error with the correlation time of a filter."""
     random, decay = np.random.default_rng(0), np.exp(-1.0 / (RATE * tau))
     error = np.zeros((N, 3))
     for k in range(1, N):
@@ -45,24 +45,24 @@ def drifting(degrees, tau=10.0):
     "attitude",
     [
         quaternions(turns(TIME)),
-        quaternions(drifting(2.0) * turns(TIME)),
-        quaternions(drifting(4.0) * turns(TIME)),
+        quaternions(drifting_rotation(2.0) * turns(TIME)),
+        quaternions(drifting_rotation(4.0) * turns(TIME)),
         quaternions(turns(TIME - 0.01)),
         quaternions(turns(TIME) * Rotation.from_euler("Z", 40, degrees=True)),
     ],
     ids=["exact", "2 degrees", "4 degrees", "10 ms late", "other axes"],
 )
 def test_a_noisy_attitude_is_used(attitude):
-    assert prepared(attitude).view == "attitude"
+    assert view_of(attitude).view == "attitude"
 
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("size", [10.0, 40.0])
 def test_a_change_of_the_sensor_does_not_exclude_the_attitude(size):
     right = quaternions(turns(TIME))
-    assert prepared(right, sensor=np.outer(TIME > 30.0, [0.8, -0.5, 0.3]) * size).view == "attitude"
-    assert prepared(right, sensor=np.outer(TIME / 60.0, [0.8, -0.5, 0.3]) * size).view == "attitude"
-    assert prepared(right, sensor=np.outer(np.sin(TIME) ** 2, [0.8, -0.5, 0.3]) * size).view == "attitude"
+    assert view_of(right, sensor=np.outer(TIME > 30.0, [0.8, -0.5, 0.3]) * size).view == "attitude"
+    assert view_of(right, sensor=np.outer(TIME / 60.0, [0.8, -0.5, 0.3]) * size).view == "attitude"
+    assert view_of(right, sensor=np.outer(np.sin(TIME) ** 2, [0.8, -0.5, 0.3]) * size).view == "attitude"
 
 
 @pytest.mark.e2e
@@ -73,13 +73,13 @@ def test_a_change_of_the_sensor_does_not_exclude_the_attitude(size):
         (quaternions(turns(TIME + 0.5)), "seems to be early by 0.5 s"),
         (dict(zip(("q_w", "q_x", "q_y", "q_z"), turns(TIME).as_quat().T, strict=True)), "in the order x, y, z, w"),
         (quaternions(turns(0.77 * TIME + 31.0)), "check that it belongs to this recording and this sensor"),
-        (quaternions(drifting(20.0) * turns(TIME)), "check that it belongs to this recording and this sensor"),
+        (quaternions(drifting_rotation(20.0) * turns(TIME)), "check that it belongs to this recording and this sensor"),
         (quaternions(turns(0.0 * TIME)), "does not turn as the field does"),
     ],
     ids=["late", "early", "order", "another's", "poor", "still"],
 )
 def test_a_wrong_attitude_is_excluded_with_the_reason(attitude, words):
-    view = prepared(attitude)
+    view = view_of(attitude)
     assert view.view == "norm"
     (sentence,) = (warning for warning in view.warnings if "attitude is left out" in warning)
     assert words in sentence
@@ -87,7 +87,7 @@ def test_a_wrong_attitude_is_excluded_with_the_reason(attitude, words):
 
 
 def test_the_warning_has_residuals_in_the_measurements_unit():
-    (sentence,) = prepared(quaternions(turns(TIME - 0.1))).warnings
+    (sentence,) = view_of(quaternions(turns(TIME - 0.1))).warnings
     assert "of the field of 47 µT, with the length 0.5 µT" in sentence
     assert "Without this fault the residual would be 0.5" in sentence
 
@@ -139,7 +139,7 @@ def test_a_requested_view_is_used_and_has_the_fault_of_its_turns():
     assert none == ""
 
 
-def test_correct_turns_have_no_fault():
+def test_correct_turns_are_not_reported_as_wrong():
     table = changed(tumbling(N, noise=0.5, sensor=STEP), **quaternions(turns(TIME)), **rates(body_rate(TIME)))
     assert [Magnetometer(use=use).prepare(table).faults for use in ("attitude", "gyro")] == [(), ()]
 

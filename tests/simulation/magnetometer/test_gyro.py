@@ -137,12 +137,12 @@ def test_a_bias_of_the_gyroscope_is_a_parameter():
     assert float(view.residual(theta, {}).square().mean().sqrt()) < 0.1 * without
 
 
-def test_prior_of_the_bias(view):
+def test_the_prior_of_the_bias_is_at_zero(view):
     assert bool((view.prior.precision[12:] > 0).all())
     assert view.prior.mean[12:].tolist() == [0.0] * 3
 
 
-def test_ports(view):
+def test_ports_are_the_field_strength_and_the_sensor(view):
     assert view.ports["field"].channels == ("strength",)
     assert not any(port.pointwise for port in view.ports.values())
     assert view.state == {"view": "gyro", "unit": "µT", "strength": view.strength}

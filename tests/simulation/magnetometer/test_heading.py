@@ -18,7 +18,7 @@ RATE = 50.0
 
 
 def recorded(N, jumps, **kwargs):
-    """A recording whose attitude is rotated about the vertical: first sample to size of each jump in degrees."""
+    """Return a recording whose attitude is rotated about the vertical: first sample to size of each jump in degrees."""
     recording = tumbling(N, attitude=True, gyro=True, **kwargs)
     off = sum(((np.arange(N) >= first) * size for first, size in jumps.items()), np.zeros(N))
     turned = Rotation.from_rotvec(off[:, None] * [0.0, 0.0, 1.0], degrees=True) * turns(recording["time"].numpy())
@@ -27,7 +27,7 @@ def recorded(N, jumps, **kwargs):
 
 
 def field_at(time):
-    """The measurement of a magnetometer without noise."""
+    """Return the measurement of a magnetometer without noise."""
     return torch.from_numpy(turns(time).inv().apply(FIELD))
 
 

@@ -45,7 +45,7 @@ def test_the_start_is_the_truth_without_noise(view):
     assert len(view.parameter_names) == len(view.start())
 
 
-def test_the_start_withstands_outliers():
+def test_the_start_is_robust_to_outliers():
     sensor = np.zeros((600, 3))
     sensor[::4] += (30.0, -50.0, 20.0)
     view = Magnetometer().prepare(tumbling(600, noise=0.1, sensor=sensor))
@@ -97,7 +97,7 @@ def test_the_signal_is_the_simulated_measurement(view):
     assert np.abs(across).max() > 0.5
 
 
-def test_ports(view):
+def test_ports_are_the_field_strength_and_the_sensor(view):
     assert {name: port.channels for name, port in view.ports.items()} == {
         "sensor": ("x", "y", "z"), "field": ("strength",),
     }  # fmt: skip
@@ -107,7 +107,7 @@ def test_ports(view):
     assert view.state == {"view": "norm", "unit": "µT", "strength": view.strength}
 
 
-def test_without_times_the_samples_are_numbered():
+def test_the_time_of_a_recording_without_times_is_the_sample_number():
     view = Magnetometer().prepare(changed(tumbling(600), time=None))
     assert torch.equal(view.time, torch.arange(600, dtype=torch.float64))
 
@@ -131,12 +131,12 @@ def test_a_turn_about_a_single_axis_is_refused_with_the_missing_directions():
         Magnetometer().prepare(tumbling(500, noise=0.3, size=(1.0, 0.0, 0.0)))
 
 
-def test_rows_that_determine_nothing_are_refused(view):
+def test_too_few_rows_for_a_start_are_refused(view):
     with pytest.raises(ValueError, match="least 9 points"):
         view.start(torch.arange(600) < 5)
 
 
-def test_columns_that_are_missing_are_named():
+def test_missing_columns_are_named():
     with pytest.raises(MissingColumnError, match="mag_y"):
         Magnetometer().prepare(changed(tumbling(100), mag_y=None))
     with pytest.raises(MissingColumnError, match="gyro_x"):

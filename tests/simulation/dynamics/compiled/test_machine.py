@@ -20,8 +20,8 @@ SPECIAL = [0.0, -0.0, 1.0, -1.0, 0.5, -2.5, 3.0, 1e-300, 1e300, np.inf, -np.inf,
 LOGICAL = ("logical_and", "logical_or", "logical_not")
 
 
-def operated(program, states, way):
-    """The outputs of a program at states (w, L), by ``way`` of compiling."""
+def outputs_of(program, states, way):
+    """Return the outputs of a program at states (w, L), by ``way`` of compiling."""
     at = program.at([])
     rows = registers(at, len(states))
     loaded(at, rows, states, 0, 0, 0, states.shape[1])
@@ -51,7 +51,7 @@ def test_an_operation_agrees_with_numpy(operation):
         expected = FUNCTIONS[operation](*given) if operation != "where" else np.where(states[0] != 0.0, *states[1:])
         for first in range(0, states.shape[1], 100):
             part = slice(first, first + 100)
-            found = operated(program, states[:, part].copy(), machine_code(run))
+            found = outputs_of(program, states[:, part].copy(), machine_code(run))
             np.testing.assert_allclose(found[0], expected[part].astype(float), rtol=1e-14)
 
 
@@ -72,7 +72,7 @@ def test_numbers_columns_and_parameters_are_rows_of_a_program():
 
 @pytest.fixture(params=[(Driven, 1, False), (Driven, 2, True), (Single, 2, False), (Single, 1, True)], ids=str)
 def collocations(request):
-    """The compiled residual, its start, and the collocation there by NumPy and by machine code."""
+    """Return the compiled residual, its start, and the collocation there by NumPy and by machine code."""
     system, runs, observed = request.param
     prepared = system().prepare(recorded(runs))
     compiled = JointModel(with_observer(prepared, 0.7) if observed else prepared)._compiled
@@ -86,7 +86,7 @@ def assert_alike(found, expected):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * max(np.abs(expected).max(initial=0.0), 1e-300))
 
 
-def test_solutions_agree(collocations):
+def test_solutions_by_numpy_and_machine_code_agree(collocations):
     compiled, theta, by_numpy, by_machine = collocations
     guess = compiled._with_first_states(compiled._system.guess, compiled._first(theta.tolist()))
     with np.errstate(all="ignore"):
@@ -100,7 +100,7 @@ def test_solutions_agree(collocations):
         np.testing.assert_array_equal(found.factor.inverse, given)  # the factor of a neighbour is not overwritten
 
 
-def test_rough_solutions_agree(collocations):
+def test_rough_solutions_by_numpy_and_machine_code_agree(collocations):
     compiled, theta, by_numpy, by_machine = collocations
     guess = compiled._with_first_states(0.0 * compiled._system.guess, compiled._first(theta.tolist()))
     inside = np.arange(guess.shape[1]) % 60 <= 40
@@ -110,7 +110,7 @@ def test_rough_solutions_agree(collocations):
     assert_alike(found, expected)
 
 
-def test_sources_agree(collocations):
+def test_source_terms_by_numpy_and_machine_code_agree(collocations):
     compiled, theta, by_numpy, by_machine = collocations
     guess = compiled._with_first_states(compiled._system.guess, compiled._first(theta.tolist()))
     with np.errstate(all="ignore"):
@@ -129,7 +129,7 @@ def test_a_guess_that_is_not_finite_has_no_solution(collocations):
     assert by_machine.solved_to(guess, np.ones(guess.shape[1], dtype=bool))[0] is None
 
 
-def test_without_numba_numpy_solves(monkeypatch):
+def test_numpy_is_the_fallback_without_numba(monkeypatch):
     monkeypatch.setattr("mkc_torch.simulation.dynamics.compiled.machine.machine_code", lambda _: None)
     prepared = Driven().prepare(recorded())
     model = JointModel(prepared)

@@ -216,7 +216,7 @@ def candidates(prepared):
 
 
 def sized(effect, port, shape):
-    """A shape whose shares of a part are in the part's unit."""
+    """Return a shape whose shares of a part are in the part's unit."""
     found = dict(shape)
     for key, (part, size) in effect.relative.items():
         if key in found and part in port.sizes:
