@@ -131,7 +131,9 @@ def main() -> None:
         times = least_milliseconds({"MKCRegression": lambda: MKCRegression().fit(X, y), **others})
     for name, taken in times.items():
         print(f"  {name:<36}{taken:>9.1f}{taken / times['MKCRegression']:>8.2f}", flush=True)
-    print(f"  from fully converged: {apart(MKCRegression().fit(X, y), X, y):.0e} standard errors")
+    print(
+        f"  from fully converged: {difference_in_standard_errors(MKCRegression().fit(X, y), X, y):.0e} standard errors"
+    )
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ from torch import Tensor
 from mkc_torch.diagnosis.evidence.held_out import gain_interval
 from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
 from mkc_torch.diagnosis.pipeline import stepwise
+from mkc_torch.diagnosis.search import ranking as ranks
 from mkc_torch.diagnosis.search import with_process_noise
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation import Dynamics, Parameter
@@ -214,7 +215,7 @@ def search_statistics(name: str, hidden: str, seed: int) -> dict[str, Any]:
 
     def free(alone: Any, terms: Any, settings: Any) -> Any:
         runs = free_runs(alone, terms, settings)
-        row["free"] = [described(run, alone) for _, run in runs]
+        row["free"] = [described(run, alone) for _, run in runs.fits]
         if hidden == NOTHING:
             raise _SearchStoppedError
         return runs

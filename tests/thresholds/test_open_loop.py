@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.thresholds.open_loop import NOTHING, SYSTEMS, drawn, rates
+from tests.thresholds.open_loop import NOTHING, SYSTEMS, drawn, rates, search_statistics
 
 
 @pytest.mark.parametrize("name", list(SYSTEMS))
@@ -28,3 +28,10 @@ def test_error_rates_count_recordings():
     lines = list(rates(rows))
     assert "ratio 0.7: by chance below 1/1; hidden effect not below 1/2, as most likely candidate 1/1" in lines[2]
     assert "gain 4.5: by chance above 1/1, hidden effect not above 0/2" in lines
+
+
+@pytest.mark.e2e
+def test_a_search_returns_the_statistics_of_its_candidates():
+    row = search_statistics("ship", "quadratic_drag", 0)
+    assert row["claimed"] in {candidate["effect"] for candidate in row["free"]}
+    assert any(candidate["right"] for candidate in row["paying"])
