@@ -22,7 +22,7 @@ from mkc_torch.diagnosis.model.process_noise import (
     refit_noise,
     refit_open_loop,
 )
-from mkc_torch.diagnosis.model.shapes import shape_fitted, with_profiled_shape
+from mkc_torch.diagnosis.model.shapes import shape_fitted, with_form_of_grid, with_profiled_shape
 from mkc_torch.diagnosis.model.term import Key, Term, continuous, run_parallel
 from mkc_torch.diagnosis.search.joint_likelihood import JointLikelihood, joint_likelihood
 from mkc_torch.diagnosis.search.own_noise import FreeRuns, free_runs, number_count, priced, with_own_noise
@@ -141,6 +141,7 @@ def search_with_process_noise(
         more = [(number, fit) for number, fit in runs if terms[number].key in known]
         works += [partial(_under_own_noise, fit, base, declared, settings) for _, fit in more]
         works = [partial(_no_less_likely, base, work, declared, settings) for work in works]
+        works = works if quick else [partial(_in_best_form, work, declared, settings) for work in works]
         chosen += [number for number, _ in more]
         fits = run_parallel(works, base.model.prepared, [terms[number] for number in chosen], _FIT)
         best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer, settings)
@@ -290,6 +291,13 @@ def _no_less_likely(
     starts = (fit.parameters, torch.cat([base.parameters, zero]))
     tried = [fitted_with_effect(base, model, start, graduate=False) for start in starts]
     return with_own_noise(max(tried, key=lambda found: found.log_likelihood), declared, settings)
+
+
+def _in_best_form(work: Callable[[], FittedModel], declared: Mapping[str, float], settings: Settings) -> FittedModel:
+    """Return a candidate's fit in its most likely form, under its remaining noise."""
+    fit = work()
+    moved = with_form_of_grid(fit)
+    return fit if moved is fit else with_own_noise(moved, declared, settings)
 
 
 def _plain(
