@@ -169,6 +169,9 @@ _MOMENT_S = 1.0
 _HINTED = 0.15
 """p-value up to which the strongest candidate is mentioned although it is not a finding."""
 
+_MENTIONED = 3
+"""Largest number of effects that are mentioned though no findings."""
+
 
 _DROPPED = ("unconfirmed", "nearest")
 """Grades of findings that are dropped if their size is 0 within its standard error."""
@@ -412,13 +415,14 @@ def _short_of_the_level(first: SearchResult, level: float) -> list[str]:
 
 
 def _as_good_as_a_disturbance(first: SearchResult) -> list[str]:
-    """Describe the effect with which the simulation follows, where a disturbance is as likely."""
-    if first.follows is None:
+    """Describe the effects with which the simulation follows, where a disturbance is as likely."""
+    names = list(dict.fromkeys(_with_shape(fit.model.terms[-1]) for fit in first.follow))[:_MENTIONED]
+    if not names:
         return []
     return [
-        f"{_with_shape(first.follows.model.terms[-1])} would explain most of the open-loop residual, but in this "
-        f"recording a disturbance explains it as well: p = {first.p_value:.2g}. A second recording, diagnosed with "
-        "this one by `--together`, would decide: physics repeats, a disturbance does not."
+        f"{' or '.join(names)} would explain most of the open-loop residual, but in this recording a disturbance "
+        f"explains it as well: p = {first.p_value:.2g}. A second recording, diagnosed with this one by `--together`, "
+        "would decide: physics repeats, a disturbance does not."
     ]
 
 

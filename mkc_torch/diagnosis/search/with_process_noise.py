@@ -173,7 +173,7 @@ def search_with_process_noise(
         ranking=ranking,
         compared=fits,
         without_candidate=bare if needless and better_noise else None,
-        follows=_follows(free, runs) if p_value > level else None,
+        follow=_follow(free, runs) if p_value > level else (),
     )
 
 
@@ -302,12 +302,16 @@ def _no_less_likely(
     return with_own_noise(max(tried, key=lambda found: found.log_likelihood), declared, settings)
 
 
-def _follows(free: FittedModel | None, runs: Sequence[tuple[int, FittedModel]]) -> FittedModel | None:
-    """Return the most likely open-loop fit, less Schwarz's penalty, if its residual is far smaller than without it."""
-    if free is None or not runs:
-        return None
-    best = max((fit for _, fit in runs), key=lambda fit: fit.log_likelihood - schwarz(fit) * number_count(fit))
-    return best if float((size_of(best.residual) / size_of(free.residual)).log().mean()) < math.log(FAR_LESS) else None
+def _follow(free: FittedModel | None, runs: Sequence[tuple[int, FittedModel]]) -> tuple[FittedModel, ...]:
+    """Return the open-loop fits with far smaller residuals than the simulation's, most likely first.
+
+    General forms, such as a power law, are left out beside others.
+    """
+    if free is None:
+        return ()
+    far = [fit for _, fit in runs if (size_of(fit.residual) / size_of(free.residual)).log().mean() < math.log(FAR_LESS)]
+    named = [fit for fit in far if not fit.model.terms[-1].effect.is_generalisation] or far
+    return tuple(sorted(named, key=lambda fit: schwarz(fit) * number_count(fit) - fit.log_likelihood))
 
 
 def _in_best_form(work: Callable[[], FittedModel], declared: Mapping[str, float], settings: Settings) -> FittedModel:
