@@ -169,7 +169,10 @@ class DiagnosedModel(CorrectingModel):
                 f"{'' if system else '; give its simulation with `simulation=`'}."
             )
         measured = tuple(map(str, self.state.get("outputs", system.outputs or system.states)))
-        return python_source(system, self.theta.tolist(), self.terms, tuple(self.gammas), measured, module, folder)
+        holds = self.state.get("input_hold", {})
+        return python_source(
+            system, self.theta.tolist(), self.terms, tuple(self.gammas), measured, holds, module, folder
+        )
 
     @staticmethod
     def from_json(

@@ -48,6 +48,7 @@ def python_source(
     terms: Sequence[Term],
     gammas: Sequence[Tensor],
     measured: Sequence[str],
+    holds: Mapping[str, str],
     module: str | None = None,
     folder: Path | None = None,
 ) -> str:
@@ -59,6 +60,7 @@ def python_source(
         theta: its parameters, then the initial states, which only give guesses of internal states.
         terms, gammas: the effects.
         measured: names of the measured outputs.
+        holds: what each input does between samples; a class has a single hold, so different ones are not exported.
         module: to import the diagnosed class from.
         folder: of the written file, if known.
     """
@@ -82,6 +84,7 @@ def python_source(
         "    parameters = {",
         *(f"        {line}" for line in _parameters(system, theta)),
         "    }",
+        *_hold(system, holds),
         *_states(system, memories, theta),
         *_actuator(inputs),
         *_derivative(memories, rates),
@@ -142,6 +145,12 @@ def _parameters(system: Dynamics, theta: Sequence[float]) -> list[str]:
             number = f"Parameter({', '.join([number, *sentences])})"
         lines.append(f'"{name}": {number},')
     return lines
+
+
+def _hold(system: Dynamics, holds: Mapping[str, str]) -> list[str]:
+    """Return the line of the inputs' hold, if the diagnosis chose another than that of the class."""
+    chosen = set(holds.values())
+    return [f'    input_hold = "{chosen.pop()}"'] if len(chosen) == 1 and chosen != {system.input_hold} else []
 
 
 def _states(system: Dynamics, memories: Mapping[str, str], theta: Sequence[float]) -> list[str]:

@@ -169,6 +169,9 @@ _MOMENT_S = 1.0
 _HINTED = 0.15
 """p-value up to which the strongest candidate is mentioned although it is not a finding."""
 
+_MENTIONED = 3
+"""Largest number of effects that are mentioned though no findings."""
+
 
 _DROPPED = ("unconfirmed", "nearest")
 """Grades of findings that are dropped if their size is 0 within its standard error."""
@@ -344,7 +347,7 @@ def with_search_notes(diagnosis: Diagnosis, search: StepwiseSearch) -> Diagnosis
     """Add warnings about rejected candidates, and about why the search ended."""
     more = [_not_confirmed(search.unconfirmed, quick=diagnosis.quick)] if search.unconfirmed else []
     if diagnosis.verdict == "unexplained" and not search.found and search.first is not None:
-        more += _short_of_the_level(search.first, diagnosis.level)
+        more += _short_of_the_level(search.first, diagnosis.level) or _as_good_as_a_disturbance(search.first)
     more += [_enlarging(refused, quick=diagnosis.quick) for refused in search.refused]
     if search.given_up:
         more.append(
@@ -408,6 +411,18 @@ def _short_of_the_level(first: SearchResult, level: float) -> list[str]:
         f"{_with_shape(first.term)} would explain the residual best, but measurement and process noise gain as much by "
         f"chance: p = {first.p_value:.2g}. A recording about {max(first.longer, 1.1):.2g} times as long would decide "
         "whether it is real."
+    ]
+
+
+def _as_good_as_a_disturbance(first: SearchResult) -> list[str]:
+    """Describe the effects with which the simulation follows, where a disturbance is as likely."""
+    names = list(dict.fromkeys(_with_shape(fit.model.terms[-1]) for fit in first.follow))[:_MENTIONED]
+    if not names:
+        return []
+    return [
+        f"{' or '.join(names)} would explain most of the open-loop residual, but in this recording a disturbance "
+        f"explains it as well: p = {first.p_value:.2g}. A second recording, diagnosed with this one by `--together`, "
+        "would decide: physics repeats, a disturbance does not."
     ]
 
 

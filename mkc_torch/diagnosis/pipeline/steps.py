@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -10,7 +11,7 @@ from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, held_
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
-from mkc_torch.diagnosis.search.own_noise import needless_terms, without
+from mkc_torch.diagnosis.search.own_noise import needless_terms, number_count, priced, without
 from mkc_torch.diagnosis.search.ranking import improves_open_loop
 from mkc_torch.diagnosis.search.run import SearchResult
 
@@ -69,6 +70,26 @@ def eliminated(search: StepwiseSearch, options: SearchOptions) -> StepwiseSearch
             break
         search = less
     return search
+
+
+def exchanged(search: StepwiseSearch, further: SearchResult, options: SearchOptions) -> StepwiseSearch | None:
+    """Replace a finding by a further one beyond their limit; None if that is not clearly more likely.
+
+    An effect that stands for a part of another, as a limit for play, is found first where the other shows only beside
+    later findings.
+    """
+    known = [without(further.fit, (number,), options.declared, options.settings) for number in range(len(search.found))]
+    fits = {number: fit for number, fit in enumerate(known) if fit is not None}
+    if not fits:
+        return None
+    least = max(fits, key=lambda number: priced(fits[number], options.settings))
+    price = 0.5 * math.log(len(further.fit.residual)) * (number_count(fits[least]) - number_count(further.fit, least))
+    gain = priced(fits[least], options.settings) - priced(search.found[-1].fit, options.settings) - price
+    if gain < options.settings.naming.separable:
+        return None
+    kept = (*(finding for number, finding in enumerate(search.found) if number != least), further)
+    left = tuple(term for term in search.left if term.key != further.term.key)
+    return with_fit(replace(search, left=left), kept, fits[least], options)
 
 
 def with_fit(

@@ -26,7 +26,7 @@ from mkc_torch.diagnosis.pipeline.simpler_form import (
     with_driver_or_time,
     with_special_case,
 )
-from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch, eliminated, with_fit
+from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch, eliminated, exchanged, with_fit
 from mkc_torch.diagnosis.search.own_noise import priced
 from mkc_torch.diagnosis.search.partner import is_undetermined, with_partner
 from mkc_torch.diagnosis.search.ranking import Ranked, alike, enlarges_open_loop
@@ -254,7 +254,7 @@ def _accept(
     if within_a_sample(located.term, located.fit.model.prepared) or not holds(located.fit, paired):
         return replace(over, unconfirmed=located)
     if len(search.found) == options.max_findings:
-        return replace(over, cut=True)
+        return exchanged(search, located, options) or replace(over, cut=True)
     fit, simpler = located.fit, after
     if located.with_noise:
         fit = simpler_by_price(located.fit, options.declared, options.settings)

@@ -55,7 +55,8 @@ def needless_terms(fit: FittedModel, declared: Mapping[str, float], settings: Se
 
     The penalty of an effect is half the logarithm of the number of samples for each of its numbers and each fitted
     number of its shape (Schwarz, Annals of Statistics 6, 1978, 461), plus the limit of separability. Two effects can
-    compensate each other, so that each pays its penalty given the other, but not both together.
+    compensate each other, so that each pays its penalty given the other, but not both together. Of an effect and its
+    special case at the same place, such as friction that falls with speed and dry friction, the weaker is needless.
 
     Args:
         fit: with several effects.
@@ -66,11 +67,22 @@ def needless_terms(fit: FittedModel, declared: Mapping[str, float], settings: Se
     for size in (1, 2) if count > 1 else ():
         sets = list(combinations(range(count), size))
         works = [partial(_loss, fit, numbers, declared, settings) for numbers in sets]
-        losses = run_parallel(works, fit.model.prepared, fit.model.terms)
-        weakest = min(range(len(sets)), key=losses.__getitem__)
+        losses = dict(zip(sets, run_parallel(works, fit.model.prepared, fit.model.terms), strict=True))
+        weakest = min(sets, key=losses.__getitem__)
         if losses[weakest] < settings.naming.separable:
-            return sets[weakest]
+            return weakest
+        nested = [(n,) for n in range(count) if any(_is_nested(fit.model.terms[n], o) for o in fit.model.terms)]
+        if size == 1 and nested:
+            return min(nested, key=losses.__getitem__)
     return ()
+
+
+def _is_nested(term: Term, other: Term) -> bool:
+    """Whether one of two effects at the same place is a special case of the other."""
+    pairs = ((term.effect, other.effect), (other.effect, term.effect))
+    return term.port == other.port and any(
+        general.reduces_to is not None and general.reduces_to.id == special.id for general, special in pairs
+    )
 
 
 def _loss(fit: FittedModel, numbers: Sequence[int], declared: Mapping[str, float], settings: Settings) -> float:

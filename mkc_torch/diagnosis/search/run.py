@@ -54,6 +54,8 @@ class SearchResult:
         with_noise: whether noise and physics were selected together.
         without_candidate: the simulation without the candidate, if the noise found with the candidate makes both
             equally likely, and more likely than the simulation's previous noise; otherwise None.
+        follow: open-loop fits with effects, most likely first, with which the simulation follows the recording far
+            better, if no candidate passed the surrogates.
     """
 
     term: Term
@@ -69,6 +71,7 @@ class SearchResult:
     longer: float = math.inf
     with_noise: bool = False
     without_candidate: FittedModel | None = None
+    follow: tuple[FittedModel, ...] = ()
 
     @property
     def scene(self) -> SearchProblem:

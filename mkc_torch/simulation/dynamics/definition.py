@@ -150,6 +150,7 @@ class Dynamics:
                 )
         return PreparedDynamics(self, used, outputs)
 
-    def correction(self, _state: Mapping[str, Any], recording: Recording) -> DynamicsCorrection:
+    def correction(self, state: Mapping[str, Any], recording: Recording) -> DynamicsCorrection:
         """Prepare the simulation for a new recording; see :class:`mkc_torch.simulation.Correction`."""
-        return DynamicsCorrection(self.prepare(recording))
+        holds = {name: how for name, how in state.get("input_hold", {}).items() if name in self.inputs}
+        return DynamicsCorrection(self.prepare(recording).with_input_hold(holds))

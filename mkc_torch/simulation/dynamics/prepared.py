@@ -58,7 +58,6 @@ class PreparedDynamics(ObservedDynamics):
         self.measured = recording.stack(*outputs)
         self.unit = common_unit(system.units.get(name, recording.units[name]) for name in outputs)
         self.independent = (True,) * len(outputs)
-        self.state: Mapping[str, object] = {"class": system.name, "outputs": list(outputs)}
         self.known = {
             name: parameter if isinstance(parameter, Parameter) else Parameter(float(parameter))
             for name, parameter in system.parameters.items()
@@ -119,6 +118,12 @@ class PreparedDynamics(ObservedDynamics):
             for k, how in enumerate(self.input_hold.values())
         ]
         return torch.cat(columns, -1) if columns else inputs.new_zeros(len(self.clock.time), 0)
+
+    @property
+    def state(self) -> Mapping[str, object]:
+        """The measured outputs, and the inputs' behaviour between samples, which a diagnosis may have chosen."""
+        holds = {"input_hold": dict(self.input_hold)} if self.input_hold else {}
+        return {"class": self.system.name, "outputs": list(self.channels), **holds}
 
     def with_input_hold(self, between: Mapping[str, str]) -> PreparedDynamics:
         """The simulation with other input interpolation, "held", "linear" or "smooth", by input name."""

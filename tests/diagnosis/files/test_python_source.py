@@ -148,3 +148,20 @@ def test_forms_with_and_without_surroundings_are_restored_from_files_and_exporte
     with_it = joint.residual(torch.cat([theta, gamma]))
     torch.testing.assert_close(written, with_it, rtol=0.0, atol=1e-6)
     assert float((with_it - prepared.residual(theta, {})).abs().max()) > 1e-3
+
+
+def test_what_inputs_do_between_samples_comes_back_from_files():
+    time = torch.arange(80, dtype=torch.float64) * 0.1
+    columns = {"time": time, "power": (2.0 * time).sin().sign(), "outside": 5.0 + time.cos(), "temp": 20.0 + time}
+    theta = torch.tensor([0.2, 20.0]).double()
+    held = Heater().prepare(Recording(columns)).with_input_hold({"power": "held", "outside": "held"})
+    columns["temp"] = columns["temp"] - held.residual(theta, {})[:, 0]
+    recording = Recording(columns)
+    model = DiagnosedModel("Heater", held.state, theta, [], [], Heater())
+    again = DiagnosedModel.from_json(model.to_json(), simulation=Heater())
+    torch.testing.assert_close(again.correct(recording)[0]["temp"], columns["temp"], rtol=0.0, atol=1e-6)
+    known = {"Heater": Heater}
+    exec(model.to_python("heaters").replace("from heaters import Heater", ""), known)
+    written = known["CorrectedHeater"]().prepare(recording).residual(theta, {})
+    assert float(written.abs().max()) < 1e-6
+    assert float(Heater().prepare(recording).residual(theta, {}).abs().max()) > 1e-2

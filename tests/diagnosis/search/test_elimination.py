@@ -13,6 +13,10 @@ from mkc_torch.diagnosis.search import own_noise
 from mkc_torch.diagnosis.search.own_noise import needless_terms, priced, without
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import DYNAMICS
+from mkc_torch.effects.dynamics.coulomb_friction import CoulombFriction
+from mkc_torch.effects.dynamics.linear_drag import LinearDrag
+from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
+from mkc_torch.effects.dynamics.stribeck_friction import StribeckFriction
 from tests.diagnosis.swing import candidates, fitted_pendulum
 
 
@@ -55,8 +59,26 @@ def test_two_jointly_needless_effects_are_removed_together(monkeypatch, together
     losses = {(0,): 40.0, (1,): 90.0, (2,): 25.0, (0, 1): 130.0, (0, 2): together, (1, 2): 120.0}
     monkeypatch.setattr(own_noise, "_loss", lambda _fit, numbers, *_: losses[numbers])
     monkeypatch.setattr(own_noise, "run_parallel", lambda works, *_: [work() for work in works])
-    fit = types.SimpleNamespace(model=types.SimpleNamespace(terms=(1, 2, 3), prepared=None))
-    assert needless_terms(fit, {}, Settings()) == needless
+    terms = [placed(drag) for drag in (LinearDrag, QuadraticDrag, CoulombFriction)]
+    assert needless_terms(fit_of(terms), {}, Settings()) == needless
+
+
+@pytest.mark.parametrize(("port", "needless"), [("rate of speed", (0,)), ("rate of angle", ())])
+def test_a_general_form_and_its_special_case_at_one_place_are_not_two_findings(monkeypatch, port, needless):
+    """Both pay their penalty; the weaker goes, unless they act on different states."""
+    losses = {(0,): 20.0, (1,): 90.0, (2,): 15.0, (0, 1): 130.0, (0, 2): 50.0, (1, 2): 120.0}
+    monkeypatch.setattr(own_noise, "_loss", lambda _fit, numbers, *_: losses[numbers])
+    monkeypatch.setattr(own_noise, "run_parallel", lambda works, *_: [work() for work in works])
+    terms = [placed(StribeckFriction), placed(CoulombFriction, port), placed(QuadraticDrag)]
+    assert needless_terms(fit_of(terms), {}, Settings()) == needless
+
+
+def placed(effect, port="rate of speed"):
+    return types.SimpleNamespace(effect=effect(), port=port)
+
+
+def fit_of(terms):
+    return types.SimpleNamespace(model=types.SimpleNamespace(terms=terms, prepared=None))
 
 
 def test_each_disturbance_of_a_fit_has_its_penalty():
