@@ -20,7 +20,7 @@ from mkc_torch.diagnosis.findings.finding import finding_of, separability
 from mkc_torch.diagnosis.findings.grading import grade_in_short, grade_of, is_zero_within_error, reasons_of, with_shape
 from mkc_torch.diagnosis.findings.noise import forcing_of, noise_summary, process_noise_of
 from mkc_torch.diagnosis.findings.shape import shape_of
-from mkc_torch.diagnosis.findings.warnings import called, evidence_warnings
+from mkc_torch.diagnosis.findings.warnings import evidence_warnings
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled, poor_fits
 from mkc_torch.diagnosis.io.model import model_of
 from mkc_torch.diagnosis.model.fit import FittedModel
@@ -29,7 +29,7 @@ from mkc_torch.diagnosis.model.shapes import described
 from mkc_torch.diagnosis.model.term import Drivers, Term
 from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
-from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
+from mkc_torch.diagnosis.pipeline.search_notes import significance
 from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Finding, Separability, Stop, Traces, notices
 from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.diagnosis.search.run import SearchResult
@@ -165,12 +165,6 @@ def verdict_of(
 
 _MOMENT_S = 1.0
 """Time limit in seconds for each optional part of a stopped diagnosis."""
-
-_HINTED = 0.15
-"""p-value up to which the strongest candidate is mentioned although it is not a finding."""
-
-_MENTIONED = 3
-"""Largest number of effects that are mentioned though no findings."""
 
 
 _DROPPED = ("unconfirmed", "nearest")
@@ -326,13 +320,9 @@ def _p_value(first: SearchResult | None, whole: DiagnosisInputs) -> float | None
     return 1.0 if first is None else first.p_value
 
 
-def _significance(p_value: float | None) -> str:
-    return "its likelihood gain exceeds its penalty" if p_value is None else f"p = {p_value:.2g} after the whole search"
-
-
 def _no_size(finding: Finding) -> str:
     return (
-        f"{finding.effect}: {_significance(finding.p_value)}, but in the open-loop fit its size is 0 within its "
+        f"{finding.effect}: {significance(finding.p_value)}, but in the open-loop fit its size is 0 within its "
         "standard error, so it does not count as a finding."
     )
 
@@ -341,25 +331,6 @@ def _white(diagnosis: Diagnosis) -> bool:
     """Whether the residual is white."""
     channels = next((result.value for result in diagnosis.evidence if result.test == "whiteness"), None)
     return not channels or all(channel.lag == 0 for channel in channels.values())
-
-
-def with_search_notes(diagnosis: Diagnosis, search: StepwiseSearch) -> Diagnosis:
-    """Add warnings about rejected candidates, and about why the search ended."""
-    more = [_not_confirmed(search.unconfirmed, quick=diagnosis.quick)] if search.unconfirmed else []
-    if diagnosis.verdict == "unexplained" and not search.found and search.first is not None:
-        more += _short_of_the_level(search.first, diagnosis.level) or _as_good_as_a_disturbance(search.first)
-    more += [_enlarging(refused, quick=diagnosis.quick) for refused in search.refused]
-    if search.given_up:
-        more.append(
-            f"The search for further findings ended early: with {called(search.found[-1].term)} in the model, a "
-            "further fit has no finite trajectory. Other physics may be missing too."
-        )
-    if search.cut:
-        more.append(
-            f"There is more structure beyond the {len(search.found)} findings, the limit; raise `max_findings` to find "
-            "it."
-        )
-    return replace(diagnosis, warnings=(*diagnosis.warnings, *more))
 
 
 def _candidates(first: SearchResult | None) -> tuple[CandidateScore, ...]:
@@ -381,49 +352,6 @@ def _candidates(first: SearchResult | None) -> tuple[CandidateScore, ...]:
 
 def _nothing_to_separate() -> Separability:
     return Separability((), torch.zeros(0, 0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
-
-
-def _not_confirmed(located: SearchResult, *, quick: bool) -> str:
-    return (
-        f"{_with_shape(located.term)}: {_significance(None if quick else located.p_value)}, but it does not predict "
-        "held-out blocks better, so it does not count as a finding."
-    )
-
-
-def _enlarging(located: SearchResult, *, quick: bool) -> str:
-    return (
-        f"{_with_shape(located.term)}: {_significance(None if quick else located.p_value)}, but the open-loop residual "
-        "is larger with it, so it does not count as a finding."
-    )
-
-
-def _with_shape(term: Term) -> str:
-    """Return the name of a candidate with its shape."""
-    shape = described(term.effect, term.shape)
-    return f"{called(term)} ({shape})" if shape else called(term)
-
-
-def _short_of_the_level(first: SearchResult, level: float) -> list[str]:
-    """Describe the best candidate above the level, and how long a recording would decide about it."""
-    if not level < first.p_value <= _HINTED or not math.isfinite(first.longer):
-        return []
-    return [
-        f"{_with_shape(first.term)} would explain the residual best, but measurement and process noise gain as much by "
-        f"chance: p = {first.p_value:.2g}. A recording about {max(first.longer, 1.1):.2g} times as long would decide "
-        "whether it is real."
-    ]
-
-
-def _as_good_as_a_disturbance(first: SearchResult) -> list[str]:
-    """Describe the effects with which the simulation follows, where a disturbance is as likely."""
-    names = list(dict.fromkeys(_with_shape(fit.model.terms[-1]) for fit in first.follow))[:_MENTIONED]
-    if not names:
-        return []
-    return [
-        f"{' or '.join(names)} would explain most of the open-loop residual, but in this recording a disturbance "
-        f"explains it as well: p = {first.p_value:.2g}. A second recording, diagnosed with this one by `--together`, "
-        "would decide: physics repeats, a disturbance does not."
-    ]
 
 
 def _time_warnings(prepared: PreparedSimulation) -> tuple[str, ...]:

@@ -17,8 +17,9 @@ from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, first_samples
 from mkc_torch.diagnosis.model.shapes import candidate_terms, within_a_sample
 from mkc_torch.diagnosis.model.term import Drivers, Term, common_parts, find_drivers
-from mkc_torch.diagnosis.pipeline.build import DiagnosisInputs, build_diagnosis, with_search_notes
+from mkc_torch.diagnosis.pipeline.build import DiagnosisInputs, build_diagnosis
 from mkc_torch.diagnosis.pipeline.prepare import Problem
+from mkc_torch.diagnosis.pipeline.search_notes import with_search_notes
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.result import Diagnosis, Stop
 from mkc_torch.diagnosis.search.estimate import estimate as final_estimate

@@ -75,8 +75,8 @@ def eliminated(search: StepwiseSearch, options: SearchOptions) -> StepwiseSearch
 def exchanged(search: StepwiseSearch, further: SearchResult, options: SearchOptions) -> StepwiseSearch | None:
     """Replace a finding by a further one beyond their limit; None if that is not clearly more likely.
 
-    An effect that stands for a part of another, as a limit for play, is found first where the other shows only beside
-    later findings.
+    An effect that stands for a part of another, such as a limit for play, is found first if the other shows only once
+    later findings are in the model.
     """
     known = [without(further.fit, (number,), options.declared, options.settings) for number in range(len(search.found))]
     fits = {number: fit for number, fit in enumerate(known) if fit is not None}

@@ -305,7 +305,7 @@ def _no_less_likely(
 def _follow(free: FittedModel | None, runs: Sequence[tuple[int, FittedModel]]) -> tuple[FittedModel, ...]:
     """Return the open-loop fits with far smaller residuals than the simulation's, most likely first.
 
-    General forms, such as a power law, are left out beside others.
+    General forms, such as a power law, are left out if there are others.
     """
     if free is None:
         return ()
