@@ -16,6 +16,7 @@ from mkc_torch.simulation import Dynamics
 
 stepwise = importlib.import_module("mkc_torch.diagnosis.pipeline.stepwise")
 steps = importlib.import_module("mkc_torch.diagnosis.pipeline.steps")
+search_notes = importlib.import_module("mkc_torch.diagnosis.pipeline.search_notes")
 
 
 POOR_FIT_SETTINGS = replace(Settings(), evidence=replace(Settings().evidence, followed=0.0))
@@ -173,8 +174,7 @@ def test_two_jointly_needless_findings_end_the_search(monkeypatch):
 
 
 def test_a_refused_candidate_is_reported_with_its_reason(recording):
-    build = importlib.import_module("mkc_torch.diagnosis.pipeline.build")
     (term, *_) = candidate_terms(Sled().prepare(recording), (), EFFECTS)
-    warning = build._enlarging(SimpleNamespace(term=term, p_value=0.01), quick=False)
+    warning = search_notes._enlarging(SimpleNamespace(term=term, p_value=0.01), quick=False)
     assert term.effect.id in warning
     assert "p = 0.01 after the whole search, but the open-loop residual is larger with it" in warning

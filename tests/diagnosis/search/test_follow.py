@@ -11,7 +11,7 @@ from mkc_torch.effects.dynamics.power_law import PowerLaw
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 
 search = importlib.import_module("mkc_torch.diagnosis.search.with_process_noise")
-build = importlib.import_module("mkc_torch.diagnosis.pipeline.build")
+search_notes = importlib.import_module("mkc_torch.diagnosis.pipeline.search_notes")
 
 
 def fit(effect, residual, log_likelihood):
@@ -40,8 +40,8 @@ def test_the_most_likely_comes_first_and_a_general_form_is_left_out():
 
 def test_the_warning_names_the_effects_and_the_remedy():
     follow = fit(LinearDrag(), 0.7, 300.0), fit(QuadraticDrag(), 0.7, 290.0)
-    (warning,) = build._as_good_as_a_disturbance(SimpleNamespace(follow=follow, p_value=0.2))
+    (warning,) = search_notes._as_good_as_a_disturbance(SimpleNamespace(follow=follow, p_value=0.2))
     assert "linear_drag or quadratic_drag would explain" in warning
     assert "p = 0.2" in warning
     assert "--together" in warning
-    assert build._as_good_as_a_disturbance(SimpleNamespace(follow=())) == []
+    assert search_notes._as_good_as_a_disturbance(SimpleNamespace(follow=())) == []
