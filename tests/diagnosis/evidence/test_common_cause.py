@@ -136,7 +136,7 @@ def test_its_model_goes_through_a_file_and_leaves_the_offset_at_the_end(diagnosi
     assert term.shape == found.model.terms[0].shape
     columns, notes = model.correct(recording)
     assert notes == (
-        "unknown depends on the time of the diagnosed recording: its final offset is subtracted from all samples.",
+        "unknown depends on the time of the diagnosed recording: its final change applies to all samples.",
     )
     strength = torch.linalg.vector_norm(torch.stack([columns[f"field_{axis}"] for axis in "xyz"], -1), dim=-1)
     truth = float(strength.median())
