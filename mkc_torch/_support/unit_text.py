@@ -77,7 +77,7 @@ def tidy(unit: str) -> str:
 
 
 def quotient(unit: str, other: str, power: int = 1) -> str:
-    """The unit ``unit / other**power``, with K for a difference in °C; empty if a unit is empty or no product of powers.
+    """The unit ``unit / other**power``, with K for a difference in °C; empty if a unit is empty or not a product.
 
     Example:
         >>> quotient("rad/s²", "rad/s", 2), quotient("rad/s²", "rad/s"), quotient("m/s²", "m/s", 2)
