@@ -77,12 +77,15 @@ def tidy(unit: str) -> str:
 
 
 def quotient(unit: str, other: str, power: int = 1) -> str:
-    """The unit ``unit / other**power``; empty if a unit is empty or not a product of powers.
+    """The unit ``unit / other**power``, with K for a difference in °C; empty if a unit is empty or not a product.
 
     Example:
         >>> quotient("rad/s²", "rad/s", 2), quotient("rad/s²", "rad/s"), quotient("m/s²", "m/s", 2)
         ('1/rad', '1/s', '1/m')
+        >>> quotient("W", "°C", 2)
+        'W/K²'
     """
+    other = "K" if other == "°C" else other
     above, below = _factors(unit), _factors(other)
     if not unit or not other or above is None or below is None:
         return ""

@@ -26,6 +26,7 @@ def output_ports(
     unit: str,
     measured: Float[Tensor, "N m"],
     fixed: Collection[str] = (),
+    unscaled: Collection[str] = (),
     run: Int[Tensor, " N"] | None = None,
 ) -> dict[str, Port]:
     """The ports of outputs.
@@ -36,6 +37,7 @@ def output_ports(
         unit: common unit; empty where the units differ.
         measured: the recorded outputs, for the sizes of the signals.
         fixed: outputs that no parameter of the simulation shifts; they have the part "fixed zero".
+        unscaled: outputs that no parameter of the simulation scales; they have the part "fixed scale".
         run: number of each sample's run; None where the simulation has no runs.
 
     Example:
@@ -49,7 +51,7 @@ def output_ports(
     port = Port(tuple(channels), unit, allows_drift=True, kind="outputs", run=run)
     ports = {ALL: replace(port, parts=joined, part_units=dict.fromkeys(joined, unit))}
     for k, name in enumerate(channels):
-        known = ["fixed zero"] * (name in fixed) + ["angle"] * angles[k]
+        known = ["fixed zero"] * (name in fixed) + ["fixed scale"] * (name in unscaled) + ["angle"] * angles[k]
         parts = dict.fromkeys(("own", "compared", *known), name)
         ports[f"output {name}"] = Port(
             (name,),

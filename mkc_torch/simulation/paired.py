@@ -182,7 +182,9 @@ class PreparedPaired(ClosedForm):
         self.state: Mapping[str, object] = {"channels": list(self.channels), "clocks": self._clock_limits.tolist()}
         self.bounds = torch.full_like(sizes, -torch.inf), torch.full_like(sizes, torch.inf)
         run = successive_runs(curve.run, self.time)
-        self.ports = output_ports(self.channels, self._units, self.unit, self.measured, self.channels, run)
+        self.ports = output_ports(
+            self.channels, self._units, self.unit, self.measured, self.channels, self.channels, run
+        )
         self.warnings: tuple[str, ...] = tuple(
             f"Column `{name}` is the same in both tables: it counts as an input of the simulator and is not compared."
             for name in same
@@ -241,7 +243,9 @@ class PairedCorrection:
             )
         units = {name: system.simulated.units[name] for name in self.channels}
         run = successive_runs(self._curve.run, self.time)
-        self.ports = output_ports(self.channels, units, "", self._curve.at(self.time), self.channels, run)
+        self.ports = output_ports(
+            self.channels, units, "", self._curve.at(self.time), self.channels, self.channels, run
+        )
 
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
         """The simulated columns with the effects; the clock offset is the mean over the fitted runs."""

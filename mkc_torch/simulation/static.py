@@ -198,7 +198,7 @@ class Static:
 
     def correction(self, state: Mapping[str, Any], recording: Recording) -> StaticCorrection:
         """The simulation with known parameters on a new recording; see :class:`mkc_torch.simulation.Correction`."""
-        return StaticCorrection(self, state.get("fixed", ()), recording)
+        return StaticCorrection(self, state.get("fixed", ()), state.get("unscaled", ()), recording)
 
 
 class PreparedStatic(ClosedForm):
@@ -231,9 +231,14 @@ class PreparedStatic(ClosedForm):
         load_forward_mode()
         tangents = torch.func.jacfwd(dual_constants(lambda theta: self.residual(theta, {})))(self.start())
         self.warnings = undetermined(tangents.flatten(0, 1), self.start(), self.parameter_names)
-        fixed = tuple(name for k, name in enumerate(self.channels) if not _can_shift(tangents, k))
-        self.state: Mapping[str, object] = {"class": system.name, "fixed": list(fixed)}
-        self.ports = _ports(system, units, self.unit, self.inputs, self.measured, fixed)
+        outputs = self._outputs(self.start(), {})
+        constants = torch.ones_like(outputs)
+        fixed, unscaled = (
+            [name for k, name in enumerate(self.channels) if not _can_add(tangents, k, added[:, k])]
+            for added in (constants, outputs)
+        )
+        self.state: Mapping[str, object] = {"class": system.name, "fixed": fixed, "unscaled": unscaled}
+        self.ports = _ports(system, units, self.unit, self.inputs, self.measured, fixed, unscaled)
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:
         return self.time.new_tensor([parameter.value for parameter in self.known.values()])
@@ -292,19 +297,20 @@ class StaticCorrection:
     Args:
         system: the function.
         fixed: outputs that no parameter of the function shifts.
+        unscaled: outputs that no parameter of the function scales.
         recording: a recording of the inputs.
 
     Raises:
         MissingColumnError: an input is missing.
     """
 
-    def __init__(self, system: Static, fixed: Sequence[str], recording: Recording) -> None:
+    def __init__(self, system: Static, fixed: Sequence[str], unscaled: Sequence[str], recording: Recording) -> None:
         self.system = system
         self.time = torch.arange(len(recording)).double() if recording.time is None else recording.time
         self.inputs = _inputs(system, recording)
         units = {name: system.units.get(name, "") for name in (*system.inputs, *system.outputs)}
         nothing = self.time.new_zeros(len(self.time), len(system.outputs))
-        self.ports = _ports(system, units, "", self.inputs, nothing, fixed)
+        self.ports = _ports(system, units, "", self.inputs, nothing, fixed, unscaled)
 
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
         """The simulated outputs with the effects."""
@@ -334,6 +340,7 @@ def _ports(
     inputs: Float[Tensor, "N k"],
     measured: Float[Tensor, "N m"],
     fixed: Sequence[str],
+    unscaled: Sequence[str],
 ) -> dict[str, Port]:
     ports = {}
     for k, name in enumerate(system.inputs):
@@ -345,18 +352,18 @@ def _ports(
             part_units={"own": units[name]},
             sizes={"own": SignalSizes.of(inputs[:, k])},
         )
-    return ports | output_ports(system.outputs, units, unit, measured, fixed)
+    return ports | output_ports(system.outputs, units, unit, measured, fixed, unscaled)
 
 
-def _can_shift(tangents: Float[Tensor, "N m p"], channel: int) -> bool:
-    """Whether a change of the parameters can shift one output by a constant and leave the others unchanged."""
-    constant = torch.zeros_like(tangents[..., :1])
-    constant[:, channel] = 1.0
-    columns, target = tangents.flatten(0, 1), constant.flatten(0, 1)
+def _can_add(tangents: Float[Tensor, "N m p"], channel: int, added: Float[Tensor, " N"]) -> bool:
+    """Whether a change of the parameters can add these values to one output and leave the others unchanged."""
+    change = torch.zeros_like(tangents[..., :1])
+    change[:, channel, 0] = added
+    columns, target = tangents.flatten(0, 1), change.flatten(0, 1)
     columns = columns / torch.linalg.vector_norm(columns, dim=0).clamp(min=1e-300)
     solution = torch.linalg.lstsq(columns, target, driver="gelsd").solution
     remainder = torch.linalg.vector_norm(target - columns @ solution)
-    return bool(remainder < 1e-6 * torch.linalg.vector_norm(target))
+    return bool(remainder <= 1e-6 * torch.linalg.vector_norm(target))
 
 
 def _numbers_of(module: nn.Module, name: str) -> dict[str, float]:

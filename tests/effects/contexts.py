@@ -65,7 +65,7 @@ def paired_context(effect, N=120):
     names = ("y", "z") if SEVERAL in effect.needs else ("y",)
     signal = torch.stack([2.0 * torch.sin((1.3 + 0.4 * k) * time) + 0.2 for k, _ in enumerate(names)], -1)
     unit = "rad" if "angle" in effect.needs else "V"
-    ports = output_ports(names, dict.fromkeys(names, unit), unit, signal, names)
+    ports = output_ports(names, dict.fromkeys(names, unit), unit, signal, names, names)
     port = ports[ALL if effect.port == "outputs" else "output y"]
     assert set(effect.needs) <= set(port.parts)
     drivers = torch.cos(0.7 * time).unsqueeze(-1) if effect.roles else time.new_zeros(N, 0)

@@ -99,7 +99,7 @@ def test_ids_are_unchanged():
     assert tuple(effect.id for effect in ATTITUDE) == ("heading_reset",)
     assert tuple(effect.id for effect in PAIRED) == (
         "gain", "offset", "delay", "clock_drift", "backlash", "output_saturation", "gravity_sag", "offset", "delay",
-        "backlash", "gravity_sag", "driver_linear", "driver_quadratic",
+        "backlash", "gravity_sag", "driver_linear", "driver_quadratic", "driver_gain", "gain_drift",
     )  # fmt: skip
     assert {effect.id for effect in DYNAMICS} >= {
         "constant_force", "linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction",
@@ -117,7 +117,7 @@ def test_ids_are_unchanged():
 
 
 def test_optional_abilities_of_effects():
-    assert {e.id for e in CATALOGUE if e.persistent_change} == {"hard_iron_step", "offset_drift"}
+    assert {e.id for e in CATALOGUE if e.persistent_change} == {"hard_iron_step", "offset_drift", "gain_drift"}
     assert {e.id for e in CATALOGUE if type(e).bind is not Effect.bind} == {"unknown"}
     assert {type(e) for e in CATALOGUE if e.has_basis} == {FieldGradient, MagneticPole}
     assert {e.id for e in CATALOGUE if e.has_code} == {e.id for e in DYNAMICS} | {"output_saturation"}
@@ -127,6 +127,7 @@ def test_optional_abilities_of_effects():
     assert {e.id for e in CATALOGUE if e.is_curve} == {"unknown"}
     assert {e.id for e in CATALOGUE if e.is_generalisation} == {
         "power_law", "hidden_lag", "hidden_mode", "gravity_sag", "driver_linear", "driver_quadratic",
+        "driver_gain",
     }  # fmt: skip
     assert {e.id for e in SENSOR if e.continuous} == {"hard_iron_step", "offset_drift", "temperature_offset"}
     assert {e.id for e in CATALOGUE if not e.has_waveform} & {"hard_iron_step", "linear_drag", "gain"} == set()

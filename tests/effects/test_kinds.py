@@ -196,3 +196,12 @@ def test_a_finding_at_a_temperature_and_its_rivals_have_thermal_names():
     assert report.rivals(found) == "constant heat flow, linear drag on the rate of speed"
     text = report.with_names("Do not correct for linear_drag yet.", {"linear_drag"}, {"linear_drag": "temperature"})
     assert text == "Do not correct for loss of heat yet."
+
+
+@pytest.mark.parametrize("name", ["constant_force", "linear_drag"])
+def test_a_state_of_unknown_kind_gets_no_mechanical_advice(name):
+    """A concentration has no weight, and no viscosity."""
+    effect = next(effect for effect in DYNAMICS if effect.id == name)
+    context = at_state(effect, "mol/L")
+    for text in (effect.explained([0.4], {}, context), effect.advised([0.4], {}, context)):
+        assert not any(word in text.lower() for word in MECHANICAL), text

@@ -73,6 +73,35 @@ def test_a_driver_is_found_and_corrects_another_recording():
 
 
 @pytest.mark.e2e
+def test_a_temperature_coefficient_is_found_and_corrects_another_recording():
+    drive = temperature()
+    table = recorded(signal(times()) * (1.0 + 0.02 * (drive - 25.0)), temperature=drive)
+    found = diagnose(Paired(simulator()), table, surrogates=19, max_findings=1)
+    first = found.findings[0]
+    assert (first.effect, first.drivers) == ("driver_gain", ("temperature",))
+    assert not any(not rival.separable for rival in first.alternatives)
+    slope, at_mean = first.parameters
+    assert slope.value == pytest.approx(0.02, abs=3.0 * slope.standard_error)
+    assert at_mean.value == pytest.approx(0.02 * (float(drive.mean()) - 25.0), abs=3.0 * at_mean.standard_error)
+    model = DiagnosedModel.from_json(found.model.to_json(), simulation=Paired(simulator(0.03)))
+    columns = model(Recording({"time": times(), "temperature": drive}))
+    assert float((columns["y"] - table["y"]).abs().median()) < 0.035
+
+
+@pytest.mark.e2e
+def test_a_drift_of_the_gain_is_found_and_its_last_value_is_kept():
+    table = recorded(signal(times()) * (1.0 + 0.15 * times() / times()[-1]))
+    found = diagnose(Paired(simulator()), table, surrogates=19, max_findings=1)
+    (first,) = found.findings
+    assert (first.effect, first.drivers) == ("gain_drift", ())
+    assert first.parameters[0].value == pytest.approx(0.15, abs=3.0 * first.parameters[0].standard_error)
+    model = DiagnosedModel.from_json(found.model.to_json(), simulation=Paired(simulator(0.03)))
+    columns, notes = model.correct(Recording({"time": times()}))
+    assert float((columns["y"] - 1.15 * signal(times())).abs().max()) < 0.06
+    assert "its final change applies to all samples" in notes[0]
+
+
+@pytest.mark.e2e
 def test_clock_offsets_below_a_sample_are_not_findings():
     found = diagnose(Paired(simulator()), recorded(signal(times() + 0.02)), surrogates=19)
     assert found.verdict == "adequate"

@@ -49,6 +49,18 @@ def test_the_driver_of_an_output_is_found(simulation):
     assert float((columns["voltage"] - table["voltage"]).abs().median()) < 0.012
 
 
+def test_a_temperature_coefficient_is_distinguished_from_the_gain_that_a_parameter_sets():
+    bench = recording(load=0.0)
+    gain = 1.0 + 0.05 * bench["current"]
+    scaled = {name: bench[name] for name in bench.names} | {"voltage": bench["voltage"] * gain}
+    found = diagnose(Thermistor(), Recording(scaled, name="bench"), surrogates=19, max_findings=1)
+    (first,) = found.findings
+    assert (first.effect, first.drivers) == ("driver_gain", ("current",))
+    assert [p.name for p in first.parameters] == ["gain_per_unit"]
+    assert first.parameters[0].value == pytest.approx(0.05, abs=0.005)
+    assert not any(rival.effect == "gain" for rival in first.alternatives)
+
+
 class Joint(Static):
     inputs = ("command",)
     outputs = ("angle",)

@@ -104,8 +104,8 @@ class DiagnosedModel(CorrectingModel):
             changes[port] = summed(changes.get(port), change, series=series)
             if term.effect.persistent_change:
                 notes.append(
-                    f"{term.effect.id} depends on the time of the diagnosed recording: its final offset is subtracted "
-                    "from all samples."
+                    f"{term.effect.id} depends on the time of the diagnosed recording: its final change applies to "
+                    "all samples."
                 )
         return correction.corrected(self.theta, changes), tuple(notes)
 

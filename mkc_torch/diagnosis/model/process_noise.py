@@ -266,7 +266,8 @@ def refit_input_hold(
 ) -> FittedModel:
     """Return the fit with the most likely holds of its inputs, given its effects.
 
-    Without the effects, another hold may have replaced them.
+    Without the effects, another hold may have replaced them. The trajectory under another hold can be too far from the
+    fit's own to be solved from there.
     """
     prepared = fit.model.prepared
     for name, how in prepared.input_hold.items():
@@ -275,7 +276,7 @@ def refit_input_hold(
                 continue
             moved = prepared.with_input_hold({name: other})
             try:
-                under = fitted(JointModel(moved, fit.model.terms, fit.model.near), fit.parameters, fit.bound)
+                under = fitted(JointModel(moved, fit.model.terms), fit.parameters, fit.bound)
             except NoFitError:
                 continue
             around = noise_of_fit(under, declared)
@@ -406,13 +407,13 @@ def _holding(
     free = None
     try:
         if base.free is not None:
-            model = JointModel(prepared.open_loop(), (), base.free.model.near)
+            model = JointModel(prepared.open_loop())
             free = fitted(model, base.free.parameters, base.free.bound, graduate=False)
         if free is not None:
             running = replace(fit_with_process_noise(free, declared, settings), starts=base.starts)
             if not (base.has_disturbances and running.has_disturbances):
                 return running
-        fit = fitted(JointModel(prepared, (), base.fit.model.near), base.fit.parameters, base.fit.bound)
+        fit = fitted(JointModel(prepared), base.fit.parameters, base.fit.bound)
     except NoFitError:
         return None
     found = _under_noise(fit, estimate_noise(fit, declared, settings, base.noise), declared, settings)

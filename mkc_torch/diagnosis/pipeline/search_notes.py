@@ -21,10 +21,10 @@ _MENTIONED = 3
 
 def with_search_notes(diagnosis: Diagnosis, search: StepwiseSearch) -> Diagnosis:
     """Add warnings about rejected candidates, and about why the search ended."""
-    more = [_not_confirmed(search.unconfirmed, quick=diagnosis.quick)] if search.unconfirmed else []
+    more = [_not_confirmed(search.unconfirmed, diagnosis)] if search.unconfirmed else []
     if diagnosis.verdict == "unexplained" and not search.found and search.first is not None:
         more += _short_of_the_level(search.first, diagnosis.level) or _as_good_as_a_disturbance(search.first)
-    more += [_enlarging(refused, quick=diagnosis.quick) for refused in search.refused]
+    more += [_enlarging(refused, diagnosis) for refused in search.refused]
     if search.given_up:
         more.append(
             f"The search for further findings ended early: with {called(search.found[-1].term)} in the model, a "
@@ -42,18 +42,25 @@ def significance(p_value: float | None) -> str:
     return "its likelihood gain exceeds its penalty" if p_value is None else f"p = {p_value:.2g} after the whole search"
 
 
-def _not_confirmed(located: SearchResult, *, quick: bool) -> str:
+def _not_confirmed(located: SearchResult, diagnosis: Diagnosis) -> str:
     return (
-        f"{_with_shape(located.term)}: {significance(None if quick else located.p_value)}, but it does not predict "
-        "held-out blocks better, so it does not count as a finding."
+        f"{_rejected(located, diagnosis)}, but it does not predict held-out blocks better, so it does not count as a "
+        "finding."
     )
 
 
-def _enlarging(located: SearchResult, *, quick: bool) -> str:
+def _enlarging(located: SearchResult, diagnosis: Diagnosis) -> str:
     return (
-        f"{_with_shape(located.term)}: {significance(None if quick else located.p_value)}, but the open-loop residual "
-        "is larger with it, so it does not count as a finding."
+        f"{_rejected(located, diagnosis)}, but the open-loop residual is larger with it, so it does not count as a "
+        "finding."
     )
+
+
+def _rejected(located: SearchResult, diagnosis: Diagnosis) -> str:
+    """Return the name and significance of a candidate, with its port if a finding has the same effect."""
+    term = located.term
+    place = f" at the {term.port}" if any(f.effect == term.effect.id for f in diagnosis.findings) else ""
+    return f"{_with_shape(term)}{place}: {significance(None if diagnosis.quick else located.p_value)}"
 
 
 def _with_shape(term: Term) -> str:

@@ -14,7 +14,12 @@ from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, block
 from mkc_torch.diagnosis.findings.finding import ended_shapes
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.process_noise import first_samples, has_process_noise, refit_open_loop
+from mkc_torch.diagnosis.model.process_noise import (
+    first_samples,
+    has_process_noise,
+    refit_input_hold,
+    refit_open_loop,
+)
 from mkc_torch.diagnosis.model.shapes import within_a_sample
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time, innovation_gain
@@ -170,7 +175,7 @@ def _located(
             quick=options.quick,
             keep=keep,
         )
-    return run_search(
+    located = run_search(
         fit,
         terms,
         level=options.level,
@@ -181,6 +186,10 @@ def _located(
         quick=options.quick,
         keep=keep,
     )
+    if options.quick or located.p_value > options.level:
+        return located
+    held = refit_input_hold(located.fit, options.declared, options.fixed, options.settings.noise)
+    return located if held is located.fit else replace(located, fit=held, term=held.model.terms[-1])
 
 
 def _is_screened_out(search: StepwiseSearch, options: SearchOptions) -> bool:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.diagnosis.model.fit import FittedModel, clipped_residual, fitted_with_effect
+from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
 from mkc_torch.diagnosis.search.linearise import linearise
@@ -251,16 +252,20 @@ def by_joint_fits(
     """Return the fit, or a simpler fit that is no worse; and the ranking, with rivals that lose their gain moved back.
 
     At a port that is not pointwise the search is linear along a trajectory that the effect has shaped: a rival can
-    follow that trajectory, but not produce it. So rivals as near as the effect are fitted, unless a ``known`` fit keeps
-    the gain.
+    follow that trajectory, but not produce it. The same holds for an effect that scales a signal: next to it a fitted
+    parameter and a constant gain differ by its factor, and without it they are equal. So rivals as near as the effect
+    are fitted, unless a ``known`` fit keeps the gain.
     """
     base, terms, own = look.scene.base, look.scene.terms, best.model.terms[-1].key
+    around = look.scene.around.model
     naming = look.settings.naming
     reach = naming.separable + max([rival.gap for rival in ranking if terms[rival.number].key == own], default=0.0)
     near = [
         rival
         for rival in ranking
-        if rival.gap < reach and terms[rival.number].key != own and look.scene.is_nonlinear(terms[rival.number])
+        if rival.gap < reach
+        and terms[rival.number].key != own
+        and (look.scene.is_nonlinear(terms[rival.number]) or _in_series(terms[rival.number], around))
     ]
     won = prefer.score(best, base)
     fitted = {fit.model.terms[-1].key: fit for fit in reversed(known) if prefer.score(fit, base) >= naming.kept * won}
@@ -316,6 +321,14 @@ def _by_innovations(
         for rival, key in ((rival, terms[rival.number].key) for rival in ranking)
     ]
     return best, tuple(sorted(moved, key=_gap))
+
+
+def _in_series(term: Term, model: JointModel) -> bool:
+    """Whether the model's last effect changes the signal that a candidate of the same port depends on."""
+    last = model.terms[-1] if model.terms else None
+    if last is None or last.port != term.port or not (last.effect.follows_signal and term.effect.follows_signal):
+        return False
+    return model.prepared.ports[term.port].in_series(term.port)
 
 
 def _tried(best: FittedModel, term: Term, look: LinearizedSearch, number: int) -> FittedModel:

@@ -52,6 +52,10 @@ class ConstantForce(RateEffect):
         ),
         "voltage": ("A constant current charges or discharges.", "Look for a bias current, a leak or a sensor's zero."),
         "current": ("A constant voltage acts.", "Look for an offset voltage or a sensor's zero."),
+        "": (
+            "The state has a constant source or loss.",
+            "Look for a source or a loss that is not recorded, a bias of an input, or a sensor's zero.",
+        ),
         "pressure": (
             "There is a constant inflow or outflow.",
             "Look for a leak, an inflow that is not recorded, or a sensor's zero.",

@@ -51,6 +51,10 @@ class LinearDrag(RateEffect):
             "Add a resistor in parallel with this coefficient, 1 / (R C).",
         ),
         "current": ("The current dies away in proportion to itself.", "Add a resistance with this coefficient, R / L."),
+        "": (
+            "The state decays in proportion to itself.",
+            "Add a loss in proportion to the state, with this coefficient.",
+        ),
         "pressure": ("The pressure falls in proportion to itself, as by a leak.", "Add a leak with this coefficient."),
     }
     source = "Stokes' law at small Reynolds numbers; viscous friction of bearings"

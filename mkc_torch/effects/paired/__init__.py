@@ -10,9 +10,11 @@ from __future__ import annotations
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.paired.clock_drift import ClockDrift
 from mkc_torch.effects.paired.delay import Delay, SeveralDelays
+from mkc_torch.effects.paired.driver_gain import DriverGain
 from mkc_torch.effects.paired.driver_linear import DriverLinear
 from mkc_torch.effects.paired.driver_quadratic import DriverQuadratic
 from mkc_torch.effects.paired.gain import Gain
+from mkc_torch.effects.paired.gain_drift import GainDrift
 from mkc_torch.effects.paired.gravity_sag import GravitySag, SeveralSag
 from mkc_torch.effects.paired.offset import Offset, SeveralOffsets
 from mkc_torch.effects.paired.output_backlash import OutputBacklash, SeveralBacklash
@@ -34,5 +36,7 @@ PAIRED: tuple[Effect, ...] = (
     SeveralSag(),
     DriverLinear(),
     DriverQuadratic(),
+    DriverGain(),
+    GainDrift(),
 )
 """The candidate effects for outputs of simulations without a state."""

@@ -182,7 +182,7 @@ def unexplained_place(diagnosis: Diagnosis) -> str:
     """Return the place of unexplained structure in a few words; empty if there is none."""
     d = diagnosis
     if not unexplained(d):
-        return ""
+        return "the intervals of rejected samples" if d.rejected_intervals else ""
     if d.stop is not None:
         return "unknown; the search was stopped"
     if d.verdict == "unexplained" and d.environment.process_noise:

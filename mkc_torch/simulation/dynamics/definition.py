@@ -92,7 +92,7 @@ class Dynamics:
         return vars(x)
 
     def actuator(self, time: Tensor, u: Any, p: Any, run: Tensor) -> Mapping[str, Tensor]:
-        """Return the inputs as they act on the system, by name; default: unchanged.
+        """Return the inputs as they act on the rates and the outputs, by name; default: unchanged.
 
         Args:
             time: (S,), in s, of the whole recording.

@@ -52,6 +52,10 @@ class ObservedDynamics:
         """The ports at which effects act."""
         raise NotImplementedError
 
+    def acting_at_samples(self, theta: Tensor, changes: Changes) -> Float[Tensor, "N u"]:
+        """The inputs that the outputs depend on, at the samples."""
+        raise NotImplementedError
+
     prior: GaussianPrior | None = None
     faults: tuple[str, ...] = ()
     jacobian: Literal["reverse twice"] = "reverse twice"
@@ -113,14 +117,17 @@ class ObservedDynamics:
         """Lasting disturbances that the observer estimates in addition to the states."""
         return () if self.observer is None else self.observer.lasting
 
-    def jump(self, theta: Tensor, changes: Changes) -> ObserverJump | None:
-        """Correction of the states by the observer at the samples; None in open loop."""
+    def jump(self, theta: Tensor, changes: Changes, inputs: Tensor | None = None) -> ObserverJump | None:
+        """Correction of the states by the observer at the samples; None in open loop.
+
+        ``inputs`` are the acting inputs at the samples if they are known.
+        """
         if self.observer is None:
             return None
         n, extra = len(self.system.states), len(self.lasting)
         memories = sum(len(memory) for memory in self.remembering(changes).values())
         places = (*range(n), *range(n + memories, n + memories + extra))
-        by_states = self.predicted(theta)
+        by_states = self.predicted(theta, self.acting_at_samples(theta, changes) if inputs is None else inputs)
 
         def predict(states: Tensor) -> Tensor:
             return by_states(states) + self.output_disturbance(states)
@@ -136,9 +143,10 @@ class ObservedDynamics:
             made = made + changes["output"](self.clean + made)
         return self.measured - made
 
-    def predicted(self, theta: Tensor) -> Callable[[Tensor], Tensor]:
-        """The function from the states at the samples to the outputs there, before the sensors."""
-        n, p, u = len(self.system.states), self.parameters_of(theta), namespace(self.system.inputs, self.inputs_at_rows)
+    def predicted(self, theta: Tensor, inputs: Tensor) -> Callable[[Tensor], Tensor]:
+        """The function from the states at the samples to the outputs there, before the sensors, with these inputs."""
+        n, p = len(self.system.states), self.parameters_of(theta)
+        u = namespace(self.system.inputs, inputs)
 
         def outputs(states: Tensor) -> Tensor:
             values = self.system.output(self.time, namespace(self.system.states, states[:, :n]), u, p)

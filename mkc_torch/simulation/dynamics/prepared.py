@@ -261,10 +261,17 @@ class PreparedDynamics(ObservedDynamics):
         return outputs if found.converged else outputs * torch.nan
 
     def outputs_by_states(
-        self, theta: Float[Tensor, " p"], changes: Changes, states: Float[Tensor, "N w"]
+        self,
+        theta: Float[Tensor, " p"],
+        changes: Changes,
+        states: Float[Tensor, "N w"],
+        inputs: Float[Tensor, "N u"] | None = None,
     ) -> Float[Tensor, "N m"]:
-        """The outputs at the samples from the states there, including internal states of effects and disturbances."""
-        outputs = self._outputs(theta, states)
+        """The outputs at the samples from the states there, including internal states of effects and disturbances.
+
+        ``inputs`` are the acting inputs at the samples if they are known.
+        """
+        outputs = self._outputs(theta, self.acting_at_samples(theta, changes) if inputs is None else inputs, states)
         if "output" in changes:
             outputs = outputs + changes["output"](outputs)
         return outputs + self.output_disturbance(states)
@@ -275,7 +282,7 @@ class PreparedDynamics(ObservedDynamics):
         jump = self.jump(theta, changes)
         at_stations = stations(self.rate(theta, changes), found.states, self.grid.step.unsqueeze(-1), jump)
         at_stations = at_stations[:, : len(self.system.states)]
-        outputs = self._outputs(theta, found.states[self.rows])
+        outputs = self._outputs(theta, self.acting_at_samples(theta, changes), found.states[self.rows])
         rates = self._rates(theta, at_stations, inputs)
         at = {
             name: self._signal(port, theta, at_stations, inputs, rates)
@@ -402,10 +409,41 @@ class PreparedDynamics(ObservedDynamics):
         acting = self.system.actuator(self.clock.time, Names(**columns), self.parameters_of(theta), run)
         return torch.stack([acting[name] for name in self.system.inputs], -1)
 
-    def _outputs(self, theta: Tensor, states: Float[Tensor, "N w"]) -> Float[Tensor, "N m"]:
+    def acting_at_samples(self, theta: Tensor, changes: Changes) -> Float[Tensor, "N u"]:
+        """The inputs at the samples, with effects and the actuator if an output depends on them."""
+        if not self.acts_on_outputs(changes):
+            return self.inputs_at_rows
+        added = self.acting_inputs(theta, changes) - self.inputs
+        last = len(added) - 1  # the station at the end; each other sample begins an interval of three stations
+        return self.inputs_at_rows + added[(3 * self.rows).clamp(max=last)]
+
+    def acts_on_outputs(self, changes: Changes) -> bool:
+        """Whether an output depends on an input directly, and an effect or the actuator changes an input."""
+        changed = any(f"input {name}" in changes for name in self.system.inputs)
+        return (changed or self._has_actuator) and self._feeds_through
+
+    @cached_property
+    def _has_actuator(self) -> bool:
+        p = self.parameters_of(self.time.new_tensor([parameter.value for parameter in self.known.values()]))
+        u = Names(**dict(zip(self.system.inputs, self.inputs.unbind(-1), strict=True)))
+        acting = self.system.actuator(self.clock.time, u, p, self.run[self.clock.before])
+        return any(acting[name] is not getattr(u, name) for name in self.system.inputs)
+
+    @cached_property
+    def _feeds_through(self) -> bool:
+        """Whether an output depends on an input directly, and not only on the states."""
+        p = self.parameters_of(self.time.new_tensor([parameter.value for parameter in self.known.values()]))
+        x = namespace(self.system.states, self.guess[self.rows])
+        moved = self.inputs_at_rows + self.inputs_at_rows.abs().amax(0, keepdim=True) + 1.0
+        found = [
+            self.system.output(self.time, x, namespace(self.system.inputs, u), p) for u in (self.inputs_at_rows, moved)
+        ]
+        return any(not torch.equal(found[0][name], found[1][name]) for name in self.channels)
+
+    def _outputs(self, theta: Tensor, inputs: Tensor, states: Float[Tensor, "N w"]) -> Float[Tensor, "N m"]:
         p = self.parameters_of(theta)
         x = namespace(self.system.states, states[:, : len(self.system.states)])
-        u = namespace(self.system.inputs, self.inputs_at_rows)
+        u = namespace(self.system.inputs, inputs)
         values = self.system.sensor(self.time, self.system.output(self.time, x, u, p), p, self.run)
         return torch.stack([values[name] for name in self.channels], -1)
 

@@ -63,6 +63,8 @@ NEVER_HIDDEN = {
     "clock_drift": "no plant has a clock of its own",
     "driver_linear": "no plant has a driver that is recorded and is no input",
     "driver_quadratic": "as for the linear one",
+    "driver_gain": "as for the linear one",
+    "gain_drift": "no plant's sensor ages",
 }
 """Effects of the catalogue that no plant could show, and why."""
 

@@ -137,7 +137,7 @@ def test_the_saved_model_of_an_unrecorded_cause_subtracts_its_final_offset(diagn
     columns, notes = model.correct(recording)
     (note,) = notes
     assert note.startswith("unknown depends on the time")
-    assert "its final offset is subtracted" in note
+    assert "its final change applies to all samples" in note
     strength = torch.linalg.vector_norm(torch.stack([columns[f"field_{axis}"] for axis in "xyz"], -1), dim=-1)
     truth = float(strength.median())
     assert abs(float(strength[-100:].mean()) - truth) < 0.01 * truth

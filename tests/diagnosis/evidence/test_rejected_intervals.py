@@ -5,7 +5,7 @@ import pytest
 from mkc_torch.diagnosis.evidence.residual_noise import RejectedByFit
 from mkc_torch.diagnosis.result import EvidenceResult
 from mkc_torch.recording.disturbance import RejectedInterval
-from mkc_torch.report.diagnosis.verdict import headline
+from mkc_torch.report.diagnosis.verdict import headline, unexplained_place
 from tests.diagnosis.factory import make_diagnosis
 
 FINAL, BEFORE = (RejectedInterval(3.0, 4.0),), (RejectedInterval(48.8, 51.8),)
@@ -20,6 +20,11 @@ def disturbed(count, **changes):
 def test_the_headline_starts_with_the_rejected_interval():
     assert headline(disturbed(0)).startswith("Disturbed between 48.8 s and 51.8 s: most samples were rejected there.")
     assert "Disturbed" not in headline(make_diagnosis(0, evidence=()))
+
+
+def test_rejected_intervals_are_not_explained():
+    assert unexplained_place(disturbed(0)) == "the intervals of rejected samples"
+    assert unexplained_place(make_diagnosis(0, evidence=())) == ""
 
 
 @pytest.mark.parametrize(("grade", "found"), [("unconfirmed", BEFORE), ("left_out", FINAL), ("small", FINAL)])

@@ -175,6 +175,16 @@ def test_two_jointly_needless_findings_end_the_search(monkeypatch):
 
 def test_a_refused_candidate_is_reported_with_its_reason(recording):
     (term, *_) = candidate_terms(Sled().prepare(recording), (), EFFECTS)
-    warning = search_notes._enlarging(SimpleNamespace(term=term, p_value=0.01), quick=False)
+    located, other = SimpleNamespace(term=term, p_value=0.01), SimpleNamespace(effect="another")
+    warning = search_notes._enlarging(located, SimpleNamespace(findings=(other,), quick=False))
     assert term.effect.id in warning
+    assert f"at the {term.port}" not in warning
     assert "p = 0.01 after the whole search, but the open-loop residual is larger with it" in warning
+
+
+def test_a_refused_candidate_with_the_name_of_a_finding_has_its_port(recording):
+    (term, *_) = candidate_terms(Sled().prepare(recording), (), EFFECTS)
+    diagnosis = SimpleNamespace(findings=(SimpleNamespace(effect=term.effect.id),), quick=False)
+    assert f" at the {term.port}: p = 0.01" in search_notes._not_confirmed(
+        SimpleNamespace(term=term, p_value=0.01), diagnosis
+    )

@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.effects.dynamics.input_lag import InputLag
 from mkc_torch.recording.recording import MissingColumnError
 from mkc_torch.simulation import Dynamics, Parameter, SimulationError
 from mkc_torch.simulation.dynamics import correction as dynamics_correction
@@ -204,6 +205,20 @@ class TestFit:
 
 
 # inputs
+
+
+class Cell(Dynamics):
+    states = ("charge",)
+    inputs = ("current",)
+    outputs = ("voltage",)
+    parameters = {"rate": Parameter(0.0005, lower=0.0), "resistance": Parameter(0.05, lower=0.0)}
+    initial = {"charge": 1.0}
+
+    def derivative(self, time, x, u, p):
+        return {"charge": -p.rate * u.current}
+
+    def output(self, time, x, u, p):
+        return {"voltage": x.charge - p.resistance * u.current}
 
 
 class Driven(Pendulum):
@@ -643,6 +658,47 @@ class TestActuatorsAndSensors:
         doubled = plain.simulated(theta, {"input torque": lambda s: s})
         torch.testing.assert_close(own.simulated(theta, {}), doubled + 0.5)
         assert set(seen["run"].tolist()) == {0, 1}
+
+    @pytest.mark.parametrize("hold", ["held", "linear"])
+    def test_an_output_that_depends_on_an_input_has_the_input_that_acts(self, hold):
+        """A cell's voltage falls with the current at once, behind the same lag or gain as its charge."""
+
+        def actuator(self, time, u, p, run):
+            return {"current": 2.0 * u.current}
+
+        time = np.arange(100) * 0.5
+        current = np.sin(time) + (time > 20.0)
+        recording = table(time=time, voltage=0.0 * time, current=current, experiment=np.repeat([3.0, 5.0], 50))
+        theta = torch.tensor([0.1, 0.3, 1.0, 0.8], dtype=torch.float64)
+        plain = made(Cell, input_hold=hold).prepare(recording)
+        own = made(Cell, input_hold=hold, actuator=actuator).prepare(recording)
+        twice = made(Cell, input_hold=hold).prepare(
+            table(**{**recording.columns, "current": 2.0 * recording["current"]})
+        )
+        changed = plain.simulated(theta, {"input current": lambda s: s})
+        torch.testing.assert_close(own.simulated(theta, {}), changed)
+        kept = slice(0, -1) if hold == "held" else slice(None)  # a held input's last sample has no interval
+        torch.testing.assert_close(changed[kept], twice.simulated(theta, {})[kept])
+
+    @pytest.mark.e2e
+    def test_a_lag_of_an_input_is_found_where_the_output_depends_on_the_input(self):
+        """The current reaches a cell in part through a lag, and its voltage shows the current at once."""
+        random = np.random.default_rng(3)
+        time, lag, share = np.arange(500.0), 30.0, 0.4
+        current = np.repeat([0.0, *random.choice([0.0, 1.0, 2.0], 24)], 20)
+        late, charge, keep = np.zeros(500), np.ones(500), math.exp(-1.0 / lag)
+        for k in range(499):
+            away = late[k] - current[k]
+            late[k + 1] = current[k] + away * keep
+            charge[k + 1] = charge[k] - (current[k] + share * away * lag * (1.0 - keep)) / 2000.0
+        voltage = noisy(charge - 0.05 * (current + share * (late - current)), noise=0.001, seed=4)
+        system = made(Cell, input_hold="held")
+        recording = table(time=time, current=current, voltage=voltage)
+        diagnosis = diagnose(system, recording, effects=(InputLag(),), surrogates=19, max_findings=1)
+        assert diagnosis.verdict == "explained"
+        sizes = {p.name: p for p in diagnosis.findings[0].parameters}
+        assert sizes["share"].value == pytest.approx(share, abs=0.01)
+        assert sizes["lag"].value == pytest.approx(lag, abs=1.5)
 
     def test_an_actuator_that_omits_an_input_raises(self):
         with pytest.raises(SimulationError, match=r"actuator does not return the input `torque`"):

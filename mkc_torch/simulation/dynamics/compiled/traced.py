@@ -59,8 +59,12 @@ class Traceable(Protocol):
     def with_memories(self, states: Tensor, memories: Sequence[str]) -> Tensor: ...
     def acting_inputs(self, theta: Tensor, changes: Changes) -> Tensor: ...
     def rate(self, theta: Tensor, changes: Changes, inputs: Tensor | None = None) -> Callable[[Tensor], Tensor]: ...
-    def jump(self, theta: Tensor, changes: Changes) -> ObserverJump | None: ...
-    def outputs_by_states(self, theta: Tensor, changes: Changes, states: Tensor) -> Tensor: ...
+    def acts_on_outputs(self, changes: Changes) -> bool: ...
+    def acting_at_samples(self, theta: Tensor, changes: Changes) -> Tensor: ...
+    def jump(self, theta: Tensor, changes: Changes, inputs: Tensor | None = None) -> ObserverJump | None: ...
+    def outputs_by_states(
+        self, theta: Tensor, changes: Changes, states: Tensor, inputs: Tensor | None = None
+    ) -> Tensor: ...
 
 
 @dataclass(frozen=True)
@@ -127,10 +131,11 @@ def _traced(system: Traceable, meaning: Meaning, size: int, stations: int, sampl
         return state_symbol(trace, samples, width)
 
     rates = system.rate(theta, changes, _inputs(system, meaning, parameters))(state_symbol(trace, stations, width))
-    jump = system.jump(theta, changes)
+    acting = _inputs_at_samples(system, meaning, parameters)
+    jump = system.jump(theta, changes, acting)
     new = None if jump is None else block(jump.measured - jump.predict(at_samples()), samples, _as_is)
     try:
-        outputs = block(system.outputs_by_states(theta, changes, at_samples()), samples, _as_is)
+        outputs = block(system.outputs_by_states(theta, changes, at_samples(), acting), samples, _as_is)
     except Exception:  # a function may raise anything on a symbol; torch computes it instead, or raises again
         outputs = None
     return Traced(
@@ -151,6 +156,15 @@ def _inputs(system: Traceable, meaning: Meaning, parameters: Symbol) -> Tensor:
     except Exception:  # a function may raise anything on a symbol; torch computes it instead, or raises again
         stations, width = len(system.grid.stations), system.inputs.shape[1]
         return course_symbol(lambda values: system.acting_inputs(*meaning(values)), parameters, stations, width)
+
+
+def _inputs_at_samples(system: Traceable, meaning: Meaning, parameters: Symbol) -> Tensor:
+    """The inputs that the outputs depend on; computed by torch where they are picked from the stations."""
+    theta, changes = meaning(parameters)
+    if not system.acts_on_outputs(changes):
+        return system.acting_at_samples(theta, changes)
+    samples, width = len(system.measured), system.inputs.shape[1]
+    return course_symbol(lambda values: system.acting_at_samples(*meaning(values)), parameters, samples, width)
 
 
 def _as_is(column: Array) -> Array:
