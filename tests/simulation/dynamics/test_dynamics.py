@@ -670,9 +670,9 @@ class TestActuatorsAndSensors:
         current = np.sin(time) + (time > 20.0)
         recording = table(time=time, voltage=0.0 * time, current=current, experiment=np.repeat([3.0, 5.0], 50))
         theta = torch.tensor([0.1, 0.3, 1.0, 0.8], dtype=torch.float64)
-        plain = made(Cell, input_hold=hold).prepare(recording)
-        own = made(Cell, input_hold=hold, actuator=actuator).prepare(recording)
-        twice = made(Cell, input_hold=hold).prepare(
+        plain = instance(Cell, input_hold=hold).prepare(recording)
+        own = instance(Cell, input_hold=hold, actuator=actuator).prepare(recording)
+        twice = instance(Cell, input_hold=hold).prepare(
             table(**{**recording.columns, "current": 2.0 * recording["current"]})
         )
         changed = plain.simulated(theta, {"input current": lambda s: s})
@@ -692,7 +692,7 @@ class TestActuatorsAndSensors:
             late[k + 1] = current[k] + away * keep
             charge[k + 1] = charge[k] - (current[k] + share * away * lag * (1.0 - keep)) / 2000.0
         voltage = noisy(charge - 0.05 * (current + share * (late - current)), noise=0.001, seed=4)
-        system = made(Cell, input_hold="held")
+        system = instance(Cell, input_hold="held")
         recording = table(time=time, current=current, voltage=voltage)
         diagnosis = diagnose(system, recording, effects=(InputLag(),), surrogates=19, max_findings=1)
         assert diagnosis.verdict == "explained"
