@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -27,6 +28,7 @@ class ObservedDynamics:
     Attributes:
         kinematic: state whose rate is another state, to that state.
         clean: (N, m), the measured outputs with outliers replaced.
+        inputs: (S, u), the inputs at the stations.
         inputs_at_rows: (N, u), the inputs at the samples.
         run: (N,), number of each sample's run.
     """
@@ -39,6 +41,7 @@ class ObservedDynamics:
     rows: Tensor
     measured: Tensor
     clean: Tensor
+    inputs: Tensor
     inputs_at_rows: Tensor
     kinematic: Mapping[str, str]
     known: Mapping[str, Parameter]
@@ -52,14 +55,45 @@ class ObservedDynamics:
         """The ports at which effects act."""
         raise NotImplementedError
 
-    def acting_at_samples(self, theta: Tensor, changes: Changes) -> Float[Tensor, "N u"]:
-        """The inputs that the outputs depend on, at the samples."""
+    def acting_inputs(self, theta: Tensor, changes: Changes) -> Float[Tensor, "S u"]:
+        """The inputs at the stations, with effects and the actuator."""
         raise NotImplementedError
 
     prior: GaussianPrior | None = None
     faults: tuple[str, ...] = ()
     jacobian: Literal["reverse twice"] = "reverse twice"
     """A user's equations are many small operations."""
+
+    def acting_at_samples(self, theta: Tensor, changes: Changes) -> Float[Tensor, "N u"]:
+        """The inputs at the samples, with effects and the actuator if an output depends on them."""
+        if not self.acts_on_outputs(changes):
+            return self.inputs_at_rows
+        added = self.acting_inputs(theta, changes) - self.inputs
+        last = len(added) - 1  # the station at the end; each other sample begins an interval of three stations
+        return self.inputs_at_rows + added[(3 * self.rows).clamp(max=last)]
+
+    def acts_on_outputs(self, changes: Changes) -> bool:
+        """Whether an output depends on an input directly, and an effect or the actuator changes an input."""
+        changed = any(f"input {name}" in changes for name in self.system.inputs)
+        return (changed or self._has_actuator) and self._feeds_through
+
+    @cached_property
+    def _has_actuator(self) -> bool:
+        p = self.parameters_of(self.time.new_tensor([parameter.value for parameter in self.known.values()]))
+        u = Names(**dict(zip(self.system.inputs, self.inputs.unbind(-1), strict=True)))
+        acting = self.system.actuator(self.clock.time, u, p, self.run[self.clock.before])
+        return any(acting[name] is not getattr(u, name) for name in self.system.inputs)
+
+    @cached_property
+    def _feeds_through(self) -> bool:
+        """Whether an output depends on an input directly, and not only on the states."""
+        p = self.parameters_of(self.time.new_tensor([parameter.value for parameter in self.known.values()]))
+        x = namespace(self.system.states, self.guess[self.rows])
+        moved = self.inputs_at_rows + self.inputs_at_rows.abs().amax(0, keepdim=True) + 1.0
+        found = [
+            self.system.output(self.time, x, namespace(self.system.inputs, u), p) for u in (self.inputs_at_rows, moved)
+        ]
+        return any(not torch.equal(found[0][name], found[1][name]) for name in self.channels)
 
     def parameters_of(self, theta: Tensor) -> Names:
         """The parameters of the equations by name."""
