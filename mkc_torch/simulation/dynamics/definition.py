@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from mkc_torch.recording.join_recordings import Clock
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.correction import DynamicsCorrection
+from mkc_torch.simulation.dynamics.lost_changes import lost_changes
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.dynamics.user_functions import check_names
 from mkc_torch.simulation.own_offsets import OwnOffset
@@ -141,6 +143,8 @@ class Dynamics:
                 f"{', '.join(recording.names)}. Name what is measured in `outputs`."
             )
         used = recording.finite("time", *self.inputs, *outputs).sorted_by_time()
+        if len(used) < len(recording) and (lost := lost_changes(recording, self.inputs, outputs)):
+            used = used.rows(torch.arange(len(used)), *lost)
         for name in (*self.inputs, *outputs):
             largest = float(used[name].abs().max())
             if largest > MOST:
