@@ -60,37 +60,6 @@ class ObservedDynamics:
     jacobian: Literal["reverse twice"] = "reverse twice"
     """A user's equations are many small operations."""
 
-    def acting_at_samples(self, theta: Tensor, changes: Changes) -> Float[Tensor, "N u"]:
-        """The inputs at the samples, with effects and the actuator if an output depends on them."""
-        if not self.acts_on_outputs(changes):
-            return self.inputs_at_rows
-        added = self.acting_inputs(theta, changes) - self.inputs
-        last = len(added) - 1  # the station at the end; each other sample begins an interval of three stations
-        return self.inputs_at_rows + added[(3 * self.rows).clamp(max=last)]
-
-    def acts_on_outputs(self, changes: Changes) -> bool:
-        """Whether an output depends on an input directly, and an effect or the actuator changes an input."""
-        changed = any(f"input {name}" in changes for name in self.system.inputs)
-        return (changed or self._has_actuator) and self._feeds_through
-
-    @cached_property
-    def _has_actuator(self) -> bool:
-        p = self.parameters_of(self.time.new_tensor([parameter.value for parameter in self.known.values()]))
-        u = Names(**dict(zip(self.system.inputs, self.inputs.unbind(-1), strict=True)))
-        acting = self.system.actuator(self.clock.time, u, p, self.run[self.clock.before])
-        return any(acting[name] is not getattr(u, name) for name in self.system.inputs)
-
-    @cached_property
-    def _feeds_through(self) -> bool:
-        """Whether an output depends on an input directly, and not only on the states."""
-        p = self.parameters_of(self.time.new_tensor([parameter.value for parameter in self.known.values()]))
-        x = namespace(self.system.states, self.guess[self.rows])
-        moved = self.inputs_at_rows + self.inputs_at_rows.abs().amax(0, keepdim=True) + 1.0
-        found = [
-            self.system.output(self.time, x, namespace(self.system.inputs, u), p) for u in (self.inputs_at_rows, moved)
-        ]
-        return any(not torch.equal(found[0][name], found[1][name]) for name in self.channels)
-
     def parameters_of(self, theta: Tensor) -> Names:
         """The parameters of the equations by name."""
         return Names(**dict(zip(self.known, theta[: len(self.known)].unbind(), strict=True)))

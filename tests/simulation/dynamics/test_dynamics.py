@@ -706,7 +706,7 @@ class TestActuatorsAndSensors:
         angle = TRUTH[0].copy()
         angle[[20, 50]] = np.nan
         for values, count in ((torque, 1), (TIME / TIME[-1], 0)):
-            warnings = made(Driven).prepare(table(time=TIME, angle=angle, torque=values)).recording.warnings
+            warnings = instance(Driven).prepare(table(time=TIME, angle=angle, torque=values)).recording.warnings
             assert sum("`torque` changes at 1 of the dropped samples" in warning for warning in warnings) == count
 
     def test_an_actuator_that_omits_an_input_raises(self):
