@@ -274,9 +274,9 @@ def refit_input_hold(
         for other in ("held", "linear"):
             if name in fixed or other == how:
                 continue
-            moved = prepared.with_input_hold({name: other})
+            moved = JointModel(prepared.with_input_hold({name: other}), fit.model.terms, fit.model.near)
             try:
-                under = fitted(JointModel(moved, fit.model.terms), fit.parameters, fit.bound)
+                under = fitted(moved, fit.parameters, fit.bound, fresh=True)
             except NoFitError:
                 continue
             around = noise_of_fit(under, declared)
@@ -407,13 +407,13 @@ def _holding(
     free = None
     try:
         if base.free is not None:
-            model = JointModel(prepared.open_loop())
-            free = fitted(model, base.free.parameters, base.free.bound, graduate=False)
+            model = JointModel(prepared.open_loop(), (), base.free.model.near)
+            free = fitted(model, base.free.parameters, base.free.bound, graduate=False, fresh=True)
         if free is not None:
             running = replace(fit_with_process_noise(free, declared, settings), starts=base.starts)
             if not (base.has_disturbances and running.has_disturbances):
                 return running
-        fit = fitted(JointModel(prepared), base.fit.parameters, base.fit.bound)
+        fit = fitted(JointModel(prepared, (), base.fit.model.near), base.fit.parameters, base.fit.bound, fresh=True)
     except NoFitError:
         return None
     found = _under_noise(fit, estimate_noise(fit, declared, settings, base.noise), declared, settings)
