@@ -54,7 +54,12 @@ def rank(monkeypatch):
         monkeypatch.setattr(joint_refits, "_tried", tried)
         monkeypatch.setattr(joint_refits, "run_parallel", lambda works, *_: [work() for work in works])
         best = fit_of(FRICTION, 100.0, size)
-        scene = SimpleNamespace(base=fit_of(None, 0.0), terms=TERMS, is_nonlinear=lambda term: term.port == NONLINEAR)
+        scene = SimpleNamespace(
+            base=fit_of(None, 0.0),
+            around=SimpleNamespace(model=SimpleNamespace(terms=())),
+            terms=TERMS,
+            is_nonlinear=lambda term: term.port == NONLINEAR,
+        )
         found, new_ranking = by_joint_fits(
             best, ranking, SimpleNamespace(scene=scene, settings=Settings()), PriorWithoutPenalties(**new), known
         )
