@@ -138,3 +138,14 @@ def test_known_fits_are_compared_even_far_behind_in_the_search(rank):
     known = [fit_of(DRAG, 90.0), fit_of(OFFSET, 90.0)]
     found, gaps, _ = rank(ranking, {}, known=known, drag=7.0, o=50.0)
     assert (found, gaps["o"]) == ("drag", 30.0), "at a pointwise port the linear search decides"
+
+
+@pytest.mark.parametrize(("port", "follows", "expected"), [("y", True, True), ("x", True, False), ("y", False, False)])
+def test_an_effect_is_in_series_if_the_last_effect_changes_the_signal_that_it_depends_on(port, follows, expected):
+    def placed(port, follows):
+        return SimpleNamespace(port=port, effect=SimpleNamespace(follows_signal=follows))
+
+    prepared = SimpleNamespace(ports={name: SimpleNamespace(in_series=lambda _: True) for name in "xy"})
+    model = SimpleNamespace(terms=(placed("y", True),), prepared=prepared)
+    assert joint_refits._in_series(placed(port, follows), model) is expected
+    assert not joint_refits._in_series(placed(port, follows), SimpleNamespace(terms=(), prepared=prepared))
