@@ -13,6 +13,7 @@ import sys
 
 import torch
 
+from mkc_torch._support.dual_constants import dual_constants
 from mkc_torch.diagnosis.findings.finding import _curve
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects import CATALOGUE, Context
@@ -30,7 +31,7 @@ if "{what}" == "pole":
         return pole.change(torch.ones(3).double(), shape, context)
 
     at = torch.tensor([2.0, 0.0, 1.0]).double()
-    slope = torch.func.vmap(lambda way: torch.func.jvp(change, (at,), (way,))[1])(torch.eye(3).double())
+    slope = torch.func.vmap(lambda way: torch.func.jvp(dual_constants(change), (at,), (way,))[1])(torch.eye(3).double())
 else:
     (cubic,) = [effect for effect in CATALOGUE if effect.id == "cubic_nonlinearity"]
     curve = _curve(Term(cubic, None, {{}}), torch.ones(3).double(), torch.eye(3).double(), context)
