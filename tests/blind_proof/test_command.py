@@ -21,6 +21,7 @@ def run(*words):
     return command.main([str(word) for word in words])
 
 
+@pytest.mark.e2e
 def test_scenarios_are_scored_and_printed_with_their_aims(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command, "diagnose", diagnose_adequate)
     folder = tmp_path / "scenarios"

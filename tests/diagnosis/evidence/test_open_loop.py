@@ -75,6 +75,7 @@ def assert_unchanged(again, base, found):
     assert again.held_out == (KEPT, KEPT)
 
 
+@pytest.mark.e2e
 def test_process_noise_is_kept_if_the_simulation_alone_diverges_open_loop():
     base, finding = under_process_noise()
     found = (finding,)

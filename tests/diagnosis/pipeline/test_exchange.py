@@ -10,6 +10,7 @@ from mkc_torch.simulation import Paired
 EFFECTS = [effect for effect in PAIRED if effect.id in ("backlash", "delay", "offset", "output_saturation")]
 
 
+@pytest.mark.e2e
 def test_play_takes_the_place_of_a_limit_that_was_found_before_the_offset():
     time = torch.arange(700, dtype=torch.float64) / 25.0
     command = 0.35 * torch.sin(2.0 * torch.pi * (0.15 * time + 0.0152 * time**2))
