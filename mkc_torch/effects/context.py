@@ -35,6 +35,7 @@ class Context:
         parts: roles of the signal's components, such as ``{"own": "speed", "position": "angle"}``.
         part_units: units of the parts.
         run: (N,), number of each sample's run; None where the simulation has no runs.
+        driver_means: means that were subtracted from the drivers.
 
     Example:
         >>> import torch
@@ -56,6 +57,12 @@ class Context:
     parts: Mapping[str, str] = field(default_factory=dict)
     part_units: Mapping[str, str] = field(default_factory=dict)
     run: Int[Tensor, " N"] | None = None
+    driver_means: tuple[float, ...] = ()
+
+    @property
+    def recorded(self) -> Float[Tensor, " N"]:
+        """The first driver as it was recorded, with its mean."""
+        return self.drivers[:, 0] + (self.driver_means[0] if self.driver_means else 0.0)
 
     @property
     def runs(self) -> Int[Tensor, " N"]:

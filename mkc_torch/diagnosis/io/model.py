@@ -294,16 +294,15 @@ def _finite(value: Any) -> float:
 def _context(term: Term, correction: Correction, recording: Recording) -> Context:
     port, time = correction.ports[term.port], correction.time
     drivers = time.new_zeros(len(time), 0)
-    units: tuple[str, ...] = ()
     if term.driver is not None:
         for column in term.driver.columns:
             if column not in recording:
                 raise missing_driver(column, term.effect.id)
-        drivers, units = recording.stack(*term.driver.columns) - term.driver.reference, term.driver.units
+        drivers = recording.stack(*term.driver.columns) - term.driver.reference
     drivers = port.at(drivers)
     time = time if port.clock is None else port.clock.time
     nothing = time.new_zeros(len(time), len(port.channels))
-    return context_at(port, time, drivers, units, nothing)
+    return context_at(port, time, drivers, term.driver, nothing)
 
 
 def missing_driver(column: str, effect: str) -> MissingColumnError:

@@ -84,6 +84,7 @@ def python_source(
         "    parameters = {",
         *(f"        {line}" for line in _parameters(system, theta)),
         "    }",
+        *_inputs(system, terms),
         *_hold(system, holds),
         *_states(system, memories, theta),
         *_actuator(inputs),
@@ -147,6 +148,13 @@ def _parameters(system: Dynamics, theta: Sequence[float]) -> list[str]:
     return lines
 
 
+def _inputs(system: Dynamics, terms: Sequence[Term]) -> list[str]:
+    """Return the line of the inputs with the columns that drive the effects."""
+    columns = dict.fromkeys(column for term in terms for column in term.columns)
+    new = [json.dumps(column, ensure_ascii=False) for column in columns if column not in system.inputs]
+    return [f"    inputs = (*{type(system).__name__}.inputs, {', '.join(new)})"] if new else []
+
+
 def _hold(system: Dynamics, holds: Mapping[str, str]) -> list[str]:
     """Return the line of the inputs' hold, if the diagnosis chose another than that of the class."""
     chosen = set(holds.values())
@@ -203,10 +211,12 @@ def _memories(term: Term) -> dict[str, str]:
 
 def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Sequence[str]) -> list[str]:
     """Return assignments that add an effect at its port."""
-    if term.driver is not None or not term.effect.has_code:
+    if not term.effect.has_code:
+        raise SourceError(f"{term.effect.id} cannot be exported as Python: it has no `code` method.")
+    if not all(column.isidentifier() for column in term.columns):
         raise SourceError(
-            f"{term.effect.id} cannot be exported as Python: "
-            + ("its driver is a recorded column." if term.driver else "it has no `code` method.")
+            f"{term.effect.id} cannot be exported as Python: its column {term.columns[0]!r} is no name in Python; "
+            "rename the column."
         )
     shape = {name: _rounded(value) for name, value in term.shape.items()}
     before: list[str] = []
@@ -225,7 +235,7 @@ def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Seque
         targets, names = [f"acting.{name}"], {"own": f"acting.{name}"}
     else:
         targets, names = [f'shown["{name}"]' for name in measured], {name: f'y["{name}"]' for name in measured}
-    added = term.effect.code(gamma, shape, names)
+    added = term.effect.code(gamma, shape, {**names, **_driver_names(term)})
     each = zip(targets, added, strict=False)
     return [*before, *(f"{target} = {target} {_signed(expression)}" for target, expression in each)]
 
@@ -249,6 +259,18 @@ def _parts(state: str, system: Dynamics) -> dict[str, str]:
         "load": "load",
         "rate": f'self.plain_rates(time, x, u, p)["{state}"]',
         "zero": repr(zero),
+    }
+
+
+def _driver_names(term: Term) -> dict[str, str]:
+    """Return expressions of an effect's driver, less its mean and as recorded."""
+    if term.driver is None:
+        return {}
+    recorded, mean = f"u.{term.driver.columns[0]}", _rounded(float(term.driver.reference[0]))
+    return {
+        "recorded": recorded,
+        "driver": f"({recorded} - {mean!r})" if mean >= 0 else f"({recorded} + {-mean!r})",
+        "zero_of_driver": repr(zero_of(term.driver.units[0])),
     }
 
 

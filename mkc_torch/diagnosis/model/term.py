@@ -267,25 +267,21 @@ class Term:
         """Return the context in which the effect is evaluated."""
         port = prepared.ports[self.port]
         time = prepared.time if port.clock is None else port.clock.time
-        values = time.new_zeros(len(time), 0)
-        units: tuple[str, ...] = ()
-        if self.driver is not None:
-            values, units = self.driver.values, self.driver.units
-            values = port.at(values)
+        values = time.new_zeros(len(time), 0) if self.driver is None else port.at(self.driver.values)
         if signal is None:
             signal = time.new_zeros(len(time), len(port.channels))
-        return context_at(port, time, values, units, signal)
+        return context_at(port, time, values, self.driver, signal)
 
     def size(self, context: Context) -> int:
         return sum(quantity.size for quantity in self.effect.quantities(self.shape, context))
 
 
-def context_at(port: Port, time: Tensor, drivers: Tensor, units: tuple[str, ...], signal: Tensor) -> Context:
-    """Return the context of an effect at a port."""
+def context_at(port: Port, time: Tensor, values: Tensor, driver: Driver | None, signal: Tensor) -> Context:
+    """Return the context of an effect at a port; the values are those of the driver, less its reference."""
     return Context(
         time,
-        drivers,
-        units,
+        values,
+        () if driver is None else driver.units,
         signal,
         port.unit,
         port.channels,
@@ -293,6 +289,7 @@ def context_at(port: Port, time: Tensor, drivers: Tensor, units: tuple[str, ...]
         port.parts,
         port.part_units,
         port.run,
+        () if driver is None else tuple(driver.reference.tolist()),
     )
 
 

@@ -12,6 +12,10 @@ from mkc_torch.effects.dynamics.coulomb_friction import CoulombFriction
 from mkc_torch.effects.dynamics.coupling import Coupling
 from mkc_torch.effects.dynamics.cubic_stiffness import CubicStiffness
 from mkc_torch.effects.dynamics.dead_zone import DeadZone
+from mkc_torch.effects.dynamics.driver_exchange import DriverExchange
+from mkc_torch.effects.dynamics.driver_force import DriverForce
+from mkc_torch.effects.dynamics.driver_input_gain import DriverInputGain
+from mkc_torch.effects.dynamics.driver_rate_constant import DriverRateConstant
 from mkc_torch.effects.dynamics.hard_stop import HardStop
 from mkc_torch.effects.dynamics.hidden_lag import HiddenLag
 from mkc_torch.effects.dynamics.hidden_mode import HiddenMode
@@ -56,6 +60,10 @@ DYNAMICS: tuple[Effect, ...] = (
     Buoyancy(),
     Coupling(),
     MagnusLift(),
+    DriverForce(),
+    DriverExchange(),
+    DriverRateConstant(to_surroundings=True),
+    DriverRateConstant(),
     HardStop(),
     OverflowInto(),
     Overflow(),
@@ -66,6 +74,7 @@ DYNAMICS: tuple[Effect, ...] = (
     InputSquare(),
     InputSaturation(),
     DeadZone(),
+    DriverInputGain(),
     Backlash(),
     SensorLag(),
     UnknownRate("difference"),

@@ -56,4 +56,5 @@ class MagnusLift(RateEffect):
         return torch.stack([-turning * context.part("other"), turning * context.part("own")], -1)
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
-        return f"-({gamma[0]!r}) * {names['other']}", f"{gamma[0]!r} * {names['own']}"
+        turning = f"({gamma[0]!r} + {gamma[1]!r} * {names['driver']})" if len(gamma) > 1 else f"({gamma[0]!r})"
+        return f"-{turning} * {names['other']}", f"{turning} * {names['own']}"
