@@ -235,7 +235,7 @@ def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Seque
         targets, names = [f"acting.{name}"], {"own": f"acting.{name}"}
     else:
         targets, names = [f'shown["{name}"]' for name in measured], {name: f'y["{name}"]' for name in measured}
-    added = term.effect.code(gamma, shape, {**names, **_driver_names(term)})
+    added = term.effect.code(gamma, shape, {**names, **_driver_names(term, names)})
     each = zip(targets, added, strict=False)
     return [*before, *(f"{target} = {target} {_signed(expression)}" for target, expression in each)]
 
@@ -262,7 +262,7 @@ def _parts(state: str, system: Dynamics) -> dict[str, str]:
     }
 
 
-def _driver_names(term: Term) -> dict[str, str]:
+def _driver_names(term: Term, names: Mapping[str, str]) -> dict[str, str]:
     """Return expressions of an effect's driver, less its mean and as recorded."""
     if term.driver is None:
         return {}
@@ -270,7 +270,7 @@ def _driver_names(term: Term) -> dict[str, str]:
     return {
         "recorded": recorded,
         "driver": f"({recorded} - {mean!r})" if mean >= 0 else f"({recorded} + {-mean!r})",
-        "zero_of_driver": repr(zero_of(term.driver.units[0])),
+        "zero_of_driver": repr(zero_of(term.driver.units[0])) if term.driver.units[0] else names.get("zero", "0.0"),
     }
 
 

@@ -40,7 +40,9 @@ class DriverExchange(RateEffect):
         return "1/s"
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
-        zeros = zero_of(context.units[0]) - zero_of(context.unit_of("own"))
+        own = context.unit_of("own")
+        # a column without a unit is in that of the state
+        zeros = zero_of(context.units[0] or own) - zero_of(own)
         return context.recorded + zeros - context.part("own")
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mkc_torch.effects.base import GainEffect
 from mkc_torch.effects.context import Context, Quantity, Shape
+from mkc_torch.effects.dynamics.rate import SURROUNDINGS
 from mkc_torch.effects.waveforms import per
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 class DriverInputGain(GainEffect):
     """An actuator's gain depends on a recorded column: thrust on the battery's voltage, a pump's flow on viscosity.
 
-    Simulation: adds ``γ (d − d̄) u`` to an input u; d̄ is the column's mean.
+    Simulation: adds ``γ (d − d̄) u`` to an input u that is not the surroundings of a state; d̄ is the column's mean.
     Drivers: any column.
     Units: γ per unit of the column.
     Plausible: any size, either sign.
@@ -30,6 +31,7 @@ class DriverInputGain(GainEffect):
     port = "input"
     follows_signal = True
     needs: tuple[str, ...] = ("own",)
+    excludes: tuple[str, ...] = (SURROUNDINGS,)  # no actuator sets an outside temperature
     roles: tuple[str, ...] = ("any", "temperature", "current")
     gain = "gain_per_unit"
     equation = "δu = γ (d − d̄) u"

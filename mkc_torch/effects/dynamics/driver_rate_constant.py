@@ -33,7 +33,6 @@ class DriverRateConstant(RateEffect):
     id = "driver_rate_constant"
     display_name = "damping that depends on a column"
     roles: tuple[str, ...] = ("any", "temperature", "current")
-    excludes: tuple[str, ...] = (SURROUNDINGS,)
     lower = -math.inf
     gain = "per_unit"
     equation = "δẋ = −γ (d − d̄) x"
@@ -59,7 +58,6 @@ class DriverRateConstant(RateEffect):
     def __init__(self, *, to_surroundings: bool = False) -> None:
         if to_surroundings:
             self.needs, self.form_parameters = ("own", SURROUNDINGS), (SURROUNDINGS,)
-            self.excludes = ()
             self.equation = "δẋ = −γ (d − d̄) (x − u)"
             self.by_kind = dict.fromkeys(
                 self.by_kind,
