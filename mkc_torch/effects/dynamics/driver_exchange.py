@@ -46,4 +46,7 @@ class DriverExchange(RateEffect):
         return context.recorded + zeros - context.part("own")
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
-        return (f"{gamma[0]!r} * ({names['recorded']} + {names['zero_of_driver']} - {names['own']} - {names['zero']})",)
+        other, own = names["recorded"], names["own"]
+        if names["zero_of_driver"] != names["zero"]:
+            other, own = f"{other} + {names['zero_of_driver']}", f"{own} - {names['zero']}"
+        return (f"{gamma[0]!r} * ({other} - {own})",)

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from mkc_torch.effects.base import GainEffect
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.dynamics.rate import SURROUNDINGS
 from mkc_torch.effects.waveforms import per
 
 if TYPE_CHECKING:
@@ -19,7 +18,8 @@ if TYPE_CHECKING:
 class DriverInputGain(GainEffect):
     """An actuator's gain depends on a recorded column: thrust on the battery's voltage, a pump's flow on viscosity.
 
-    Simulation: adds ``γ (d − d̄) u`` to an input u that is not the surroundings of a state; d̄ is the column's mean.
+    Simulation: adds ``γ (d − d̄) u`` to an input u of differential equations that is not the surroundings of a state;
+        d̄ is the column's mean. For other simulations see :class:`mkc_torch.effects.paired.driver_gain.DriverGain`.
     Drivers: any column.
     Units: γ per unit of the column.
     Plausible: any size, either sign.
@@ -30,8 +30,7 @@ class DriverInputGain(GainEffect):
     display_name = "actuator's gain that depends on a column"
     port = "input"
     follows_signal = True
-    needs: tuple[str, ...] = ("own",)
-    excludes: tuple[str, ...] = (SURROUNDINGS,)  # no actuator sets an outside temperature
+    needs: tuple[str, ...] = ("own", "actuator")
     roles: tuple[str, ...] = ("any", "temperature", "current")
     gain = "gain_per_unit"
     equation = "δu = γ (d − d̄) u"

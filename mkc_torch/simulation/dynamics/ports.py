@@ -85,13 +85,13 @@ class PortContext:
             port = self._rate_port(first, "exchange", {"own": first, "other": second, **sideways, **levels})
             places[f"exchange of {first} and {second}"] = replace(port, channels=(first, second))
         for name in system.inputs:
-            around = {"surroundings": name} if name in self._surroundings.values() else {}
+            actuator = {} if name in self._surroundings.values() else {"actuator": name}
             places[f"input {name}"] = Port(
                 (name,),
                 self._unit_of(name),
                 pointwise=False,
                 kind="input",
-                parts={"own": name, **around},
+                parts={"own": name, **actuator},
                 part_units={"own": self._unit_of(name)},
                 sizes={"own": SignalSizes.of(self.recording[name])},
                 clock=self.clock,
