@@ -28,16 +28,19 @@ def heading_context(N=60):
 
 
 def dynamic_context(effect, N=80, driven=False):
-    """Return a context with uneven times at a port that has all parts an effect may need."""
+    """Return a context with uneven times at a port that has all parts an effect may need.
+
+    With ``driven``, or if the effect needs a driver, the context has one, with a mean of 2.
+    """
     generator = torch.Generator().manual_seed(1)
     time = 0.02 + 0.05 * torch.rand(N, generator=generator, dtype=torch.float64).cumsum(0)
-    drivers, driver_units = time.new_zeros(N, 0), ()
-    if driven:
-        drivers, driver_units = torch.cos(3.0 * time).unsqueeze(-1), UNITS[effect.roles[0]]
+    drivers, driver_units, means = time.new_zeros(N, 0), (), ()
+    if driven or needs_driver(effect):
+        drivers, driver_units, means = torch.cos(3.0 * time).unsqueeze(-1), UNITS[effect.roles[0]], (2.0,)
     if effect.port in ("input", "output"):
         parts, units = {"own": "force"}, {"own": "N"}
         signal = oscillating(N, 1)
-        return Context(time, drivers, driver_units, signal, "N", ("force",), parts=parts, part_units=units)
+        return Context(time, drivers, driver_units, signal, "N", ("force",), (), parts, units, None, means)
     names = ("angle", "speed", "other", "load", "rate")
     parts = {
         "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "reversing": "speed",
@@ -51,7 +54,12 @@ def dynamic_context(effect, N=80, driven=False):
     channels = ("speed", "other") if effect.port == "exchange" else ("speed",)
     signal = oscillating(N, len(names))
     signal[:, 3] = signal[:, 3].abs()
-    return Context(time, drivers, driver_units, signal, "rad/s/s", channels, names, parts, units)
+    return Context(time, drivers, driver_units, signal, "rad/s/s", channels, names, parts, units, None, means)
+
+
+def needs_driver(effect):
+    """Return whether an effect is tried with a driver only."""
+    return bool(effect.roles) and not effect.driver_optional
 
 
 def oscillating(N, count):
@@ -79,7 +87,7 @@ def contexts_of(effect):
     if effect in PAIRED or any(type(known.simpler) is type(effect) for known in PAIRED if known.simpler):
         return (paired_context(effect),)
     if effect in DYNAMICS or any(type(known.simpler) is type(effect) for known in DYNAMICS if known.simpler):
-        return (dynamic_context(effect), *([dynamic_context(effect, driven=True)] if effect.roles else []))
+        return (dynamic_context(effect), *([dynamic_context(effect, driven=True)] if effect.driver_optional else []))
     return make_context(effect), make_context(effect, channels=("strength",))
 
 

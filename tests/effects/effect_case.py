@@ -27,7 +27,7 @@ def is_nonlinear(effect):
 UNITLESS = ("share", "share_of_load", "gain_error", "gain_at_mean", "gain_change", "rate")
 """Names of quantities without a unit."""
 
-DECLARED_FOLLOWS_SIGNAL = {"constant_force": True, "heading_reset": False}
+DECLARED_FOLLOWS_SIGNAL = {"constant_force": True, "driver_force": True, "heading_reset": False}
 """Exceptions of ``follows_signal``: all effects on a rate have it; the signal of a heading has no noise."""
 
 
@@ -263,9 +263,6 @@ class OfEveryShape:
             with pytest.raises(NotImplementedError, match="`code`"):
                 effect.code(gamma.tolist(), shape, {})
             return
-        if context.units:  # effects with a driver have no code
-            assert effect.driver_optional
-            return
         carried = context.carries or context.channels
         inner = ("memory", "memory_2")[: len(memory_at(effect.port, "speed"))]
         if inner:  # internal states are solved jointly
@@ -276,7 +273,12 @@ class OfEveryShape:
         names["zero"] = "273.15" if context.unit_of("own") == "°C" else "0.0"
         if not effect.needs and effect.port == "output":  # it acts on all outputs
             names = {name: f"x.{name}" for name in carried}
+        if context.units:
+            means = context.driver_means or (0.0,)
+            names |= {"recorded": "d", "driver": f"(d - {means[0]!r})"}
+            names["zero_of_driver"] = "273.15" if context.units[0] == "°C" else "0.0"
         known = {"x": x, "torch": torch, "time": context.time, "run": context.runs}
+        known |= {"d": context.recorded} if context.units else {}
         known |= {"lagged": lagged, "shifted": shifted, "played": played, "soft_clip": soft_clip, "beyond": beyond}
         known["curve_within"] = curve_within
         shape = {name: float(value) for name, value in shape.items()}

@@ -106,11 +106,12 @@ def test_ids_are_unchanged():
         "load_dependent_friction", "cubic_stiffness", "position_periodic_force", "coupling", "hard_stop", "overflow",
         "thermal_loss", "input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlash", "bouc_wen_hysteresis",
         "added_mass", "magnus_lift", "buoyancy", "hidden_lag", "hidden_mode", "power_law", "input_lag", "input_square",
+        "driver_force", "driver_exchange", "driver_rate_constant", "driver_input_gain",
     }  # fmt: skip
     assert (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED) == CATALOGUE
     several = (
         "unknown", "field_gradient", "power_law", "linear_drag", "thermal_loss", "backlash", "delay", "offset",
-        "gravity_sag", "overflow",
+        "gravity_sag", "overflow", "driver_rate_constant",
     )  # fmt: skip
     named = [effect.id for effect in CATALOGUE if effect.id not in several]
     assert len(set(named)) == len(named)

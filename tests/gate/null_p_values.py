@@ -97,7 +97,7 @@ def summary_row(p_values: Sequence[float]) -> dict[str, float]:
     """The numbers of a row of the table.
 
     Example:
-        >>> numbers([0.01, 0.2, 0.5, 0.9])["below"]
+        >>> summary_row([0.01, 0.2, 0.5, 0.9])["below"]
         0.25
     """
     distance, p = uniformity(p_values)

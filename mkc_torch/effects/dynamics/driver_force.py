@@ -10,10 +10,13 @@ from torch import Tensor
 
 from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.kinds import MOTION
 from mkc_torch.effects.waveforms import per
 
 if TYPE_CHECKING:
     from jaxtyping import Float
+
+_ADVICE = "Make the column an input of the simulation, if it is a cause of the change and not a consequence."
 
 
 class DriverForce(RateEffect):
@@ -27,35 +30,32 @@ class DriverForce(RateEffect):
     """
 
     id = "driver_force"
-    display_name = "force in proportion to a column"
+    display_name = "source in proportion to a column"
     roles: tuple[str, ...] = ("any", "current")
     lower = -math.inf
     gain = "per_unit"
     plot_axis = ""
     equation = "δẋ = γ d"
-    explanation = "A force acts in proportion to this column."
-    advice = "Make the column an input of the simulation, if it is a cause of the motion and not a consequence."
+    explanation = "The state has a source or a loss in proportion to this column."
+    advice = _ADVICE
     display_name_by_kind: Mapping[str, str] = {
+        **dict.fromkeys(MOTION, "force in proportion to a column"),
         "temperature": "heat flow in proportion to a column",
         "level": "flow in proportion to a column",
         "pressure": "flow in proportion to a column",
         "voltage": "current in proportion to a column",
         "current": "voltage in proportion to a column",
-        "": "source in proportion to a column",
     }
     by_kind: Mapping[str, tuple[str, str]] = {
-        kind: (
-            f"{what} in proportion to this column.",
-            "Make the column an input of the simulation, if it is a cause of the change and not a consequence.",
+        kind: (f"{what} in proportion to this column.", _ADVICE)
+        for kind, what in (
+            *((kind, "A force acts") for kind in MOTION),
+            ("temperature", "Heat flows in or out"),
+            ("level", "Something flows in or out"),
+            ("pressure", "Something flows in or out"),
+            ("voltage", "A current charges or discharges"),
+            ("current", "A voltage acts"),
         )
-        for kind, what in {
-            "temperature": "Heat flows in or out",
-            "level": "Something flows in or out",
-            "pressure": "Something flows in or out",
-            "voltage": "A current charges or discharges",
-            "current": "A voltage acts",
-            "": "The state has a source or a loss",
-        }.items()
     }
     source = "balances of force, heat, mass and charge, linear in the cause"
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.dynamics.rate import SURROUNDINGS, RateEffect
+from mkc_torch.effects.kinds import MOTION
 from mkc_torch.effects.waveforms import per
 
 if TYPE_CHECKING:
@@ -31,26 +32,26 @@ class DriverRateConstant(RateEffect):
     """
 
     id = "driver_rate_constant"
-    display_name = "damping that depends on a column"
+    display_name = "rate constant that depends on a column"
     roles: tuple[str, ...] = ("any", "temperature", "current")
     lower = -math.inf
     gain = "per_unit"
     equation = "δẋ = −γ (d − d̄) x"
-    explanation = "The motion is damped in proportion to its speed, by a factor that depends on this column."
-    advice = "Let the damping depend on the column, and fit it again."
+    explanation = "The state is lost in proportion to itself, by a factor that depends on this column."
+    advice = "Let the coefficient of the loss depend on the column, and fit it again."
     display_name_by_kind: Mapping[str, str] = {
+        **dict.fromkeys(MOTION, "damping that depends on a column"),
         "temperature": "loss of heat that depends on a column",
         "level": "leak that depends on a column",
         "pressure": "leak that depends on a column",
         "voltage": "leak of charge that depends on a column",
         "current": "resistance that depends on a column",
-        "": "rate constant that depends on a column",
     }
     by_kind: Mapping[str, tuple[str, str]] = dict.fromkeys(
-        ("temperature", "level", "pressure", "voltage", "current", ""),
+        MOTION,
         (
-            "The state is lost in proportion to itself, by a factor that depends on this column.",
-            "Let the coefficient of the loss depend on the column, and fit it again.",
+            "The motion is damped in proportion to its speed, by a factor that depends on this column.",
+            "Let the damping depend on the column, and fit it again.",
         ),
     )
     source = "Incropera et al., Fundamentals of Heat and Mass Transfer (2007), 7; Arrhenius' law, to first order"
@@ -59,13 +60,9 @@ class DriverRateConstant(RateEffect):
         if to_surroundings:
             self.needs, self.form_parameters = ("own", SURROUNDINGS), (SURROUNDINGS,)
             self.equation = "δẋ = −γ (d − d̄) (x − u)"
-            self.by_kind = dict.fromkeys(
-                self.by_kind,
-                (
-                    "The exchange with the surroundings depends on this column.",
-                    "Let the coefficient of the exchange depend on the column, and fit it again.",
-                ),
-            )
+            self.by_kind = {}
+            self.explanation = "The exchange with the surroundings depends on this column."
+            self.advice = "Let the coefficient of the exchange depend on the column, and fit it again."
 
     def shapes(self, time: object) -> Sequence[Shape]:
         return (dict.fromkeys(self.form_parameters, 1.0),)

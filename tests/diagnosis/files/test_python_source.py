@@ -8,7 +8,8 @@ from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.io.python_source import SourceError
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import candidate_terms
-from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.model.term import Term, find_drivers
+from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.dynamics.thermal_loss import ThermalLoss
@@ -148,6 +149,55 @@ def test_forms_with_and_without_surroundings_are_restored_from_files_and_exporte
     with_it = joint.residual(torch.cat([theta, gamma]))
     torch.testing.assert_close(written, with_it, rtol=0.0, atol=1e-6)
     assert float((with_it - prepared.residual(theta, {})).abs().max()) > 1e-3
+
+
+def driven_heater():
+    """Return a heater's recording with a sun and a cellar's temperature that the heater does not use."""
+    time = torch.arange(80, dtype=torch.float64) * 0.1
+    columns = {"time": time, "power": 3.0 + torch.sin(time), "outside": 5.0 + time.cos(), "temp": 20.0 + time}
+    columns |= {"sun": 4.0 + torch.cos(2.0 * time), "temperature_cellar": 281.0 + torch.sin(0.5 * time)}
+    return Recording(columns, units={"temp": "°C", "temperature_cellar": "K"})
+
+
+DRIVEN = ("driver_force", "driver_exchange", "driver_rate_constant", "driver_input_gain")
+
+
+@pytest.mark.parametrize("effect_id", DRIVEN)
+def test_effects_of_columns_are_restored_from_files_and_exported_with_the_column_as_an_input(effect_id):
+    recording = driven_heater()
+    prepared = Heater().prepare(recording)
+    drivers = find_drivers(recording, frozenset(Heater().columns), DriverSettings()).drivers
+    forms = [term for term in candidate_terms(prepared, drivers, DYNAMICS) if term.effect.id == effect_id]
+    assert forms
+    for term in forms:
+        joint = JointModel(prepared, (term,))
+        theta, gamma = torch.tensor([0.2, 20.0]).double(), torch.full((1,), 0.02).double()
+        model = DiagnosedModel("Heater", prepared.state, theta, [term], [gamma], Heater())
+        with_it = joint.residual(torch.cat([theta, gamma]))
+        again = DiagnosedModel.from_json(model.to_json(), simulation=Heater())
+        assert again.terms[0].effect is term.effect
+        known = {"Heater": Heater}
+        exec(model.to_python("heaters").replace("from heaters import Heater", ""), known)
+        corrected = known["CorrectedHeater"]()
+        assert corrected.inputs == ("power", "outside", *term.columns)
+        torch.testing.assert_close(corrected.prepare(recording).residual(theta, {}), with_it, rtol=0.0, atol=1e-6)
+        assert float((with_it - prepared.residual(theta, {})).abs().max()) > 1e-3
+
+
+def test_a_column_whose_name_is_no_name_in_python_is_refused():
+    recording = driven_heater()
+    recording = Recording({**{name: recording[name] for name in recording.names}, "sun 2": recording["sun"].square()})
+    prepared = Heater().prepare(recording)
+    drivers = find_drivers(recording, frozenset(Heater().columns), DriverSettings()).drivers
+    (term,) = (
+        term
+        for term in candidate_terms(prepared, drivers, DYNAMICS)
+        if (term.effect.id, term.columns) == ("driver_force", ("sun 2",))
+    )
+    theta, gamma = torch.tensor([0.2, 20.0]).double(), torch.full((1,), 0.02).double()
+    model = DiagnosedModel("Heater", prepared.state, theta, [term], [gamma], Heater())
+    with pytest.raises(SourceError, match=r"'sun 2'.*rename"):
+        model.to_python("heaters")
 
 
 def test_what_inputs_do_between_samples_comes_back_from_files():

@@ -58,10 +58,11 @@ def test_signs_of_amplitudes():
         assert effect.one_sided or effect.id in EITHER_SIGN or effect.id not in IDS
 
 
-def test_effects_on_equations_depend_on_states_or_inputs_only():
+def test_effects_on_equations_depend_on_states_inputs_or_columns():
+    driven = {effect.id for effect in DYNAMICS if effect.roles and not effect.driver_optional}
+    assert driven == {"driver_force", "driver_exchange", "driver_rate_constant", "driver_input_gain"}
     for effect in DYNAMICS:
         assert effect.follows_signal
-        assert effect.roles == () or effect.driver_optional
         assert all(low > 0.0 for low, _ in effect.fitted_shape.values())
         assert effect.plot_axis in ("", *dynamic_context(effect).parts)
         assert effect.equation.startswith("δ")
@@ -434,6 +435,7 @@ class TestNeeds:
         known = {
             "own", "position", "angle", "deflection", "reversing", "load", "temperature", "level", "other level",
             "other", "rate", "height", "sideways", "flowing", "surroundings",
+            "actuator",
         }  # fmt: skip
         for effect in DYNAMICS:
             assert set(effect.needs) <= known
