@@ -18,7 +18,7 @@ from mkc_torch.diagnosis.model.process_noise import (
 from mkc_torch.diagnosis.pipeline.build import assess_baseline, impossible_rotations
 from mkc_torch.diagnosis.pipeline.partial import PartialResult
 from mkc_torch.diagnosis.pipeline.prepare import Problem
-from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
+from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch, eliminated, revised
 from mkc_torch.diagnosis.pipeline.stepwise import first_step, next_step
 from mkc_torch.diagnosis.search.estimate import with_smaller_step
 from mkc_torch.simulation.protocol import PreparedSimulation
@@ -57,6 +57,10 @@ def stepwise_search(problem: Problem, known: PartialResult, baseline: ProcessNoi
         known.keep_search(search)
         if search.found == before.found:
             break
+    if len(search.found) > 1:
+        progress("comparing the findings again with their rivals")
+        search = eliminated(revised(search, options), options)
+        known.keep_search(search)
     return search
 
 

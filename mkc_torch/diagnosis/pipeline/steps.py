@@ -6,14 +6,24 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, held_out
-from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.model.fit import FittedModel, without_term
+from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise, refit_open_loop
+from mkc_torch.diagnosis.model.term import Term, run_parallel
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
-from mkc_torch.diagnosis.search.own_noise import needless_terms, number_count, priced, without
+from mkc_torch.diagnosis.search.own_noise import (
+    free_runs,
+    needless_terms,
+    number_count,
+    priced,
+    without,
+)
 from mkc_torch.diagnosis.search.ranking import improves_open_loop
 from mkc_torch.diagnosis.search.run import SearchResult
+from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.nonlinear import NoFitError
 
 
 @dataclass(frozen=True)
@@ -90,6 +100,52 @@ def exchanged(search: StepwiseSearch, further: SearchResult, options: SearchOpti
     kept = (*(finding for number, finding in enumerate(search.found) if number != least), further)
     left = tuple(term for term in search.left if term.key != further.term.key)
     return with_fit(replace(search, left=left), kept, fits[least], options)
+
+
+def revised(search: StepwiseSearch, options: SearchOptions) -> StepwiseSearch:
+    """Replace earlier findings by rivals of their searches that are clearly more likely beside the other findings.
+
+    An earlier finding was chosen while the later ones were missing, and may stand for a part of them.
+    """
+    if options.quick or not all(finding.with_noise for finding in search.found):
+        return search
+    for finding in search.found[:-1]:
+        search = _with_better_rival(search, finding, options) or search
+    return search
+
+
+def _with_better_rival(search: StepwiseSearch, finding: SearchResult, options: SearchOptions) -> StepwiseSearch | None:
+    """Replace a finding by its most likely rival; None if that is not clearly more likely.
+
+    The rivals start from the open loop: a fit under the remaining noise would keep to the finding's parameters.
+    """
+    final, settings = search.found[-1].fit, options.settings
+    number = next(n for n, known in enumerate(search.found) if known.term.key == finding.term.key)
+    free = refit_open_loop(without_term(final, number))
+    keys = {known.term.key for known in search.found}
+    terms = [term for term in finding.scene.terms if term.key not in keys]
+    if free is None or not terms:
+        return None
+    works = [partial(_under_own_noise, run, options) for _, run in free_runs(free, terms, settings).fits]
+    fits = [fit for fit in run_parallel(works, free.model.prepared, terms) if fit is not None]
+    best = max(fits, key=lambda fit: _score(fit, -1, settings), default=None)
+    if best is None or _score(best, -1, settings) < _score(final, number, settings) + settings.naming.separable:
+        return None
+    kept = tuple(known for n, known in enumerate(search.found) if n != number)
+    return with_fit(search, (*kept, replace(finding, term=best.model.terms[-1])), best, options)
+
+
+def _under_own_noise(run: FittedModel, options: SearchOptions) -> FittedModel | None:
+    """Return an open-loop fit again under the noise that remains; None if that has no finite result."""
+    try:
+        return fit_with_process_noise(run, options.declared, options.settings.noise).fit
+    except NoFitError:
+        return None
+
+
+def _score(fit: FittedModel, number: int, settings: Settings) -> float:
+    """Log-likelihood less the penalty of the noise, and Schwarz's penalty of one effect."""
+    return priced(fit, settings) - 0.5 * math.log(len(fit.residual)) * number_count(fit, number)
 
 
 def with_fit(

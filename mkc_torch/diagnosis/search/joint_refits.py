@@ -17,7 +17,7 @@ from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
 from mkc_torch.diagnosis.search.linearise import linearise
-from mkc_torch.diagnosis.search.problem import LinearizedSearch, refined
+from mkc_torch.diagnosis.search.problem import CandidateSearch, refined
 from mkc_torch.diagnosis.search.ranking import ModelPrior, Ranked, best_first, in_order, schwarz, within_reach
 from mkc_torch.diagnosis.search.tangents import ModelTangents, tangents_of
 from mkc_torch.diagnosis.settings import SearchSettings, Settings
@@ -228,7 +228,7 @@ def _reshaped(fit: FittedModel, base: FittedModel, term: Term) -> FittedModel:
     return fitted_with_effect(base, model, torch.cat([kept, more]), graduate=False)
 
 
-def refitted(best: FittedModel, term: Term, look: LinearizedSearch, number: int) -> FittedModel:
+def refitted(best: FittedModel, term: Term, look: CandidateSearch, number: int) -> FittedModel:
     """Return the joint fit of a candidate in place of another, from its size in the search."""
     base, gamma = look.scene.base, look.estimate(number)
     gamma = gamma.clamp(max=0.0) if term.effect.one_sided else gamma
@@ -245,7 +245,7 @@ def refitted(best: FittedModel, term: Term, look: LinearizedSearch, number: int)
 def by_joint_fits(
     best: FittedModel,
     ranking: tuple[Ranked, ...],
-    look: LinearizedSearch,
+    look: CandidateSearch,
     prefer: ModelPrior,
     known: Sequence[FittedModel],
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
@@ -331,7 +331,7 @@ def _in_series(term: Term, model: JointModel) -> bool:
     return model.prepared.ports[term.port].in_series(term.port)
 
 
-def _tried(best: FittedModel, term: Term, look: LinearizedSearch, number: int) -> FittedModel:
+def _tried(best: FittedModel, term: Term, look: CandidateSearch, number: int) -> FittedModel:
     return refined(refitted(best, term, look, number), look.scene.base)
 
 

@@ -52,13 +52,13 @@ class SearchProblem:
         """The projection to the cosine basis, for noise of any spectrum."""
         return CosineProjection.of(self.values, self.counts, self.tangents, self.tangents.slow)
 
-    def under(self, spectrum: NoiseSpectrum | None = None) -> LinearizedSearch:
+    def under(self, spectrum: NoiseSpectrum | None = None) -> CandidateSearch:
         """Return the search under noise of a spectrum, by default the most likely."""
         parameters = self.around.parameters[: self.base.model.size]
         found = linearise(
             self.base.model, parameters, self.values, self.counts, self.tangents, spectrum=spectrum, seen=self._seen
         )
-        return LinearizedSearch(self, found)
+        return CandidateSearch(self, found)
 
     def without(self, stretch: tuple[int, int]) -> SearchProblem:
         """Return the problem with a stretch of samples masked."""
@@ -76,7 +76,7 @@ class SearchProblem:
 
 
 @dataclass(frozen=True)
-class LinearizedSearch:
+class CandidateSearch:
     """A search problem and its search under one noise spectrum.
 
     Attributes:
@@ -119,17 +119,17 @@ class LinearizedSearch:
         """Return the likelihood ratios of other candidates."""
         return self.linearised.gains_of(self.scene.tangents_of(terms), self.scene.counts)
 
-    def with_more(self, terms: Sequence[Term]) -> LinearizedSearch:
+    def with_more(self, terms: Sequence[Term]) -> CandidateSearch:
         """Return the search with these candidates after its own."""
         added, scene = self.scene.tangents_of(terms), self.scene
         tangents = replace(scene.tangents, candidates=one_after_the_other(scene.tangents.candidates, added))
         more = replace(scene, terms=(*scene.terms, *terms), tangents=tangents)
-        return LinearizedSearch(more, self.linearised.with_more(added, scene.counts))
+        return CandidateSearch(more, self.linearised.with_more(added, scene.counts))
 
-    def given(self, term: Term, fit: FittedModel) -> LinearizedSearch:
+    def given(self, term: Term, fit: FittedModel) -> CandidateSearch:
         """Return the search with the tangents of a term, at a fit with it, projected out of everything."""
         own = Candidates(fit.model, fit.parameters, [term], self.scene.tangents.pointwise)
-        return LinearizedSearch(self.scene, self.linearised.without(own, self.scene.counts))
+        return CandidateSearch(self.scene, self.linearised.without(own, self.scene.counts))
 
     def own_p(self, term: Term) -> float:
         """Return the p-value of a candidate as if it were the only candidate."""
@@ -163,7 +163,7 @@ def refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> Fit
     return refined(moved, base) if again else moved
 
 
-def refine_candidates(terms: Sequence[Term], look: LinearizedSearch) -> tuple[Term, ...]:
+def refine_candidates(terms: Sequence[Term], look: CandidateSearch) -> tuple[Term, ...]:
     """Return candidates with their continuous shape numbers refined under the noise of the search.
 
     Only at pointwise ports: elsewhere each shape needs a new trajectory.
@@ -183,7 +183,7 @@ def refine_candidates(terms: Sequence[Term], look: LinearizedSearch) -> tuple[Te
     return tuple(refine_candidates)
 
 
-def with_spectrum(best: FittedModel, look: LinearizedSearch) -> FittedModel:
+def with_spectrum(best: FittedModel, look: CandidateSearch) -> FittedModel:
     """Return the fit with the shape that is most likely under the noise of the search; a joint fit assumes white noise.
 
     Another shape is taken if it is clearly better; otherwise the middle of the equivalent shapes, such as all onsets

@@ -16,7 +16,7 @@ from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import refit_open_loop
 from mkc_torch.diagnosis.model.term import ANY, Driver, Key, Term, continuous, run_parallel
 from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
-from mkc_torch.diagnosis.search.problem import LinearizedSearch
+from mkc_torch.diagnosis.search.problem import CandidateSearch
 from mkc_torch.diagnosis.settings import NamingSettings, SearchSettings
 from mkc_torch.simulation.protocol import PreparedSimulation
 
@@ -185,7 +185,7 @@ class Ranked:
     gap: float
 
 
-def ranked(look: LinearizedSearch, prefer: ModelPrior) -> tuple[Ranked, ...]:
+def ranked(look: CandidateSearch, prefer: ModelPrior) -> tuple[Ranked, ...]:
     """Rank effects at their best possible shapes by gain, less 1 nat per parameter and shape number, less penalties."""
     terms, found = look.scene.terms, look.gains
     gain = 0.5 * found.ratio[:, 0]

@@ -19,7 +19,7 @@ from mkc_torch.diagnosis.search.estimate import drift_residuals
 from mkc_torch.diagnosis.search.joint_refits import by_joint_fits, refitted, strongest
 from mkc_torch.diagnosis.search.linearise import LinearisedSearch
 from mkc_torch.diagnosis.search.problem import (
-    LinearizedSearch,
+    CandidateSearch,
     SearchProblem,
     refine_candidates,
     refined,
@@ -64,7 +64,7 @@ class SearchResult:
     beyond: float
     ranking: tuple[Ranked, ...]
     noise: NoiseFit
-    look: LinearizedSearch
+    look: CandidateSearch
     tested_search: LinearisedSearch
     stretch: tuple[int, int] | None = None
     compared: Sequence[FittedModel] = ()
@@ -209,7 +209,7 @@ def _shows(base: FittedModel, fit: FittedModel, settings: Settings) -> bool:
     return float(rejected.double().mean()) < search.hidden and bool((fit.d > search.smaller * base.d).all())
 
 
-def _judged(look: LinearizedSearch, tried: int, surrogates: int, generator: torch.Generator) -> tuple[float, float]:
+def _judged(look: CandidateSearch, tried: int, surrogates: int, generator: torch.Generator) -> tuple[float, float]:
     """Apply :func:`surrogate_p_value` to the first ``tried`` candidates."""
     noise = look.settings.noise
     return surrogate_p_value(
@@ -222,7 +222,7 @@ class _NamedEffect(NamedTuple):
 
     fit: FittedModel
     ranking: tuple[Ranked, ...]
-    look: LinearizedSearch
+    look: CandidateSearch
 
 
 def _named(

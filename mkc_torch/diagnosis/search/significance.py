@@ -14,7 +14,7 @@ from mkc_torch.diagnosis.noise.spectrum import whittle
 from mkc_torch.diagnosis.search.estimate import explained
 from mkc_torch.diagnosis.search.linear_search import SearchGains, log_survival
 from mkc_torch.diagnosis.search.linearise import LinearisedSearch
-from mkc_torch.diagnosis.search.problem import LinearizedSearch
+from mkc_torch.diagnosis.search.problem import CandidateSearch
 from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ def pays(gain: float, numbers: float, samples: int, candidates: int) -> bool:
     return gain > price(numbers, samples, candidates)
 
 
-def any_pays(look: LinearizedSearch, possible: Bool[Tensor, " tried"]) -> float:
+def any_pays(look: CandidateSearch, possible: Bool[Tensor, " tried"]) -> float:
     """Return :data:`COUNTS` if one of the first candidates gains more than its penalty, else :data:`COUNTS_NOT`.
 
     Args:
