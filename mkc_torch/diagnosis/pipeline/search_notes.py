@@ -10,6 +10,7 @@ from mkc_torch.diagnosis.model.shapes import described
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.result import Diagnosis
+from mkc_torch.diagnosis.search.ranking import is_hardly_visible
 from mkc_torch.diagnosis.search.run import SearchResult
 
 _HINTED = 0.15
@@ -24,7 +25,7 @@ def with_search_notes(diagnosis: Diagnosis, search: StepwiseSearch) -> Diagnosis
     more = [_not_confirmed(search.unconfirmed, diagnosis)] if search.unconfirmed else []
     if diagnosis.verdict == "unexplained" and not search.found and search.first is not None:
         more += _short_of_the_level(search.first, diagnosis.level) or _as_good_as_a_disturbance(search.first)
-    more += [_enlarging(refused, diagnosis) for refused in search.refused]
+    more += [_refused(refused, diagnosis) for refused in search.refused]
     if search.given_up:
         more.append(
             f"The search for further findings ended early: with {called(search.found[-1].term)} in the model, a "
@@ -49,11 +50,13 @@ def _not_confirmed(located: SearchResult, diagnosis: Diagnosis) -> str:
     )
 
 
-def _enlarging(located: SearchResult, diagnosis: Diagnosis) -> str:
-    return (
-        f"{_rejected(located, diagnosis)}, but the open-loop residual is larger with it, so it does not count as a "
-        "finding."
+def _refused(located: SearchResult, diagnosis: Diagnosis) -> str:
+    why = (
+        "it turns the sensor's vector far more than it changes its length, so its size is not determined and it"
+        if is_hardly_visible(located.fit)
+        else "the open-loop residual is larger with it, so it"
     )
+    return f"{_rejected(located, diagnosis)}, but {why} does not count as a finding."
 
 
 def _rejected(located: SearchResult, diagnosis: Diagnosis) -> str:

@@ -38,7 +38,7 @@ class StepwiseSearch:
         evidence: of the simulation without findings, and after each finding.
         left: candidates that remain to be searched; empty once the search is over.
         pairs: evidence without and with each finding under the same process noise, by which it was confirmed.
-        refused: candidates that passed the surrogates, but enlarge the open-loop residual.
+        refused: candidates that passed the surrogates, but enlarge the open-loop residual or are hardly visible.
         given_up: why the next search failed; empty if it did not.
         cut: whether there was a further finding beyond the limit.
     """

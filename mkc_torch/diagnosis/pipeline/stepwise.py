@@ -34,7 +34,7 @@ from mkc_torch.diagnosis.pipeline.simpler_form import (
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch, eliminated, exchanged, with_fit
 from mkc_torch.diagnosis.search.own_noise import priced
 from mkc_torch.diagnosis.search.partner import is_undetermined, with_partner
-from mkc_torch.diagnosis.search.ranking import Ranked, alike, enlarges_open_loop
+from mkc_torch.diagnosis.search.ranking import Ranked, alike, enlarges_open_loop, is_hardly_visible
 from mkc_torch.diagnosis.search.run import SearchResult, run_search, screening_p_value
 from mkc_torch.diagnosis.search.with_process_noise import search_with_process_noise
 from mkc_torch.diagnosis.settings import ConfirmationSettings, Settings
@@ -140,8 +140,9 @@ def next_step(
 
 
 def _add(search: StepwiseSearch, fit: FittedModel, located: SearchResult, options: SearchOptions) -> StepwiseSearch:
-    """Add a located candidate if it counts as a finding and does not enlarge the open-loop residual of findings."""
-    if search.found and located.p_value <= options.level and enlarges_open_loop(located.fit, fit):
+    """Add a located candidate if it counts as a finding, is visible, and does not enlarge the open-loop residual."""
+    spoils = is_hardly_visible(located.fit) or (bool(search.found) and enlarges_open_loop(located.fit, fit))
+    if located.p_value <= options.level and spoils:
         return replace(search, left=(), refused=(*search.refused, located))
     try:
         return _accept(search, fit, located, options)

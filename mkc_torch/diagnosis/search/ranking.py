@@ -16,8 +16,9 @@ from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import refit_open_loop
 from mkc_torch.diagnosis.model.term import ANY, Driver, Key, Term, continuous, run_parallel
 from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
+from mkc_torch.diagnosis.search.own_noise import priced
 from mkc_torch.diagnosis.search.problem import CandidateSearch
-from mkc_torch.diagnosis.settings import NamingSettings, SearchSettings
+from mkc_torch.diagnosis.settings import NamingSettings, SearchSettings, Settings
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
@@ -45,6 +46,9 @@ Judgement, checked on the same recordings: fitted in open loop, the hidden effec
 nothing is hidden, some candidate is below it in 3 of 4 under a disturbance of a state, and in 0 of 6 with a slow error
 of the sensor. So this ratio alone names nothing: the rival has to pay its price too.
 """
+
+VISIBLE = 0.1
+"""Share of an offset that a length has to show: a small offset in random directions shows 1 / √3. By reasoning."""
 
 LARGER = 1.05
 """Ratio of open-loop residuals with and without a candidate above which it enlarges the open-loop residual: the ratio
@@ -199,6 +203,31 @@ def ranked(look: CandidateSearch, prefer: ModelPrior) -> tuple[Ranked, ...]:
     return tuple(Ranked(number, float(gain[number]), float(score.max() - score[number])) for number in best.values())
 
 
+def by_own_noise(
+    base: FittedModel,
+    ranking: tuple[Ranked, ...],
+    chosen: Sequence[int],
+    fits: Sequence[FittedModel],
+    terms: tuple[Term, ...],
+    prefer: ModelPrior,
+    settings: Settings,
+) -> tuple[FittedModel, tuple[Ranked, ...]]:
+    """Return the most likely fit, and the ranking by distance to it; candidates that were not fitted come last."""
+    scores = [prefer.score_with_shape(fit, base) + (priced(fit, settings) - fit.log_likelihood) for fit in fits]
+    best = in_order(scores, [fit.model.terms[-1] for fit in fits])[0]
+    behind: dict[Key, tuple[float, int]] = {}
+    for number, score in zip(chosen, scores, strict=True):
+        key, gap = terms[number].key, scores[best] - score
+        behind[key] = min((gap, number), behind.get(key, (gap, number)))
+    last = max(gap for gap, _ in behind.values())
+    moved = []
+    for rival in ranking:
+        key = terms[rival.number].key
+        gap, number = behind.get(key, (max(last, rival.gap), rival.number))
+        moved.append(replace(rival, number=number, gap=gap))
+    return fits[best], tuple(sorted(moved, key=lambda rival: rival.gap))
+
+
 def with_open_loop_gain(
     best: FittedModel,
     ranking: tuple[Ranked, ...],
@@ -244,6 +273,39 @@ def with_open_loop_gain(
     return chosen, tuple(sorted(moved, key=lambda rival: (terms[rival.number].key != key, rival.gap)))
 
 
+def with_lags_of_sensors(
+    best: FittedModel,
+    ranking: tuple[Ranked, ...],
+    fits: Sequence[FittedModel],
+    runs: Mapping[int, FittedModel],
+    terms: tuple[Term, ...],
+) -> tuple[tuple[Ranked, ...], tuple[FittedModel, ...]]:
+    """Return ranking and fits with lags and delays of sensors as far behind the first as in the open loop, if nearer.
+
+    A filter undoes a sensor's memory with the recorded outputs, which is exact for short lags only; in the open loop,
+    the lag of a sensor and that of an actuator can be the same.
+
+    Args:
+        best: the first candidate.
+        ranking: of the candidates.
+        fits: of the leading candidates, each under its own noise; the open-loop fit takes the place of such a fit.
+        runs: open-loop fits of candidates by their number, as far as they are known.
+        terms: all candidates.
+    """
+    known = {terms[number].key: fit for number, fit in runs.items()}
+    first = known.get(best.model.terms[-1].key)
+    gaps = {terms[rival.number].key: rival.gap for rival in ranking[1:]}
+    nearer = {
+        key: max(first.log_likelihood - fit.log_likelihood, 0.0)
+        for key, fit in known.items()
+        if first is not None and fit.model.terms[-1].effect.remembers and key[2] == "output" and key in gaps
+    }
+    nearer = {key: gap for key, gap in nearer.items() if gap < gaps[key]}
+    moved = [replace(rival, gap=nearer.get(terms[rival.number].key, rival.gap)) for rival in ranking[1:]]
+    kept = tuple(known[key] if (key := fit.model.terms[-1].key) in nearer else fit for fit in fits)
+    return ranking[:1] + tuple(sorted(moved, key=lambda rival: rival.gap)), kept
+
+
 def improves_open_loop(fit: FittedModel, less: FittedModel) -> bool:
     """Whether a joint fit has a clearly smaller open-loop residual than the fit without one of its effects."""
     runs = refit_open_loop(fit), refit_open_loop(less)
@@ -265,6 +327,24 @@ def enlarges_open_loop(fit: FittedModel, less: FittedModel) -> bool:
         return False
     mean_squares = [run.residual.square().mean(0) for run in runs if run is not None]
     return 0.5 * float((mean_squares[0] / mean_squares[1]).log().mean()) > math.log(LARGER)
+
+
+def is_hardly_visible(fit: FittedModel) -> bool:
+    """Whether the last effect moves a sensor's vector far more than the compared length of the vector.
+
+    An offset can mirror all later vectors with nearly the same length. Such a fit says little of the offset, and spoils
+    every vector that it corrects. False where each component of the vector is compared.
+    """
+    model, term = fit.model, fit.model.terms[-1]
+    port = model.prepared.ports[term.port]
+    if len(port.channels) <= fit.residual.shape[1] or not port.pointwise or not term.effect.has_waveform:
+        return False
+    size = model.sizes[-1]
+    gone = torch.cat([fit.parameters[:-size], torch.zeros_like(fit.parameters[-size:])])
+    seen = model.residual(fit.parameters) - model.residual(gone)
+    context = term.context(model.prepared, model.signals(gone)[term.port])
+    moved = term.effect.change(fit.parameters[-size:], term.shape, context)
+    return bool(seen.square().sum() < VISIBLE**2 * moved.square().sum())
 
 
 def _open_loop_size(fit: FittedModel, known: Mapping[Key, FittedModel]) -> float:

@@ -27,7 +27,16 @@ from mkc_torch.diagnosis.model.term import Key, Term, continuous, run_parallel
 from mkc_torch.diagnosis.search.joint_likelihood import JointLikelihood, joint_likelihood
 from mkc_torch.diagnosis.search.own_noise import FreeRuns, free_runs, number_count, priced, with_own_noise
 from mkc_torch.diagnosis.search.problem import SearchProblem
-from mkc_torch.diagnosis.search.ranking import ModelPrior, Ranked, in_order, schwarz, with_open_loop_gain, within_reach
+from mkc_torch.diagnosis.search.ranking import (
+    ModelPrior,
+    Ranked,
+    by_own_noise,
+    in_order,
+    schwarz,
+    with_lags_of_sensors,
+    with_open_loop_gain,
+    within_reach,
+)
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.search.significance import price
 from mkc_torch.diagnosis.search.tangents import tangents_of
@@ -152,11 +161,12 @@ def search_with_process_noise(
         works = works if quick else [partial(_in_best_form, work, declared, settings) for work in works]
         chosen += [number for number, _ in more]
         fits = run_parallel(works, base.model.prepared, [terms[number] for number in chosen], _FIT)
-        best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer, settings)
+        best, ranking = by_own_noise(base, ranking, chosen, fits, terms, prefer, settings)
         best, ranking = _by_free_run(best, ranking, fits, terms, settings)
         if free is not None and not quick:
             paying = [fit for fit in fits if _pays(base, fit, prefer, settings)]
             best, ranking = with_open_loop_gain(best, ranking, paying, free, dict(runs), terms)
+            ranking, fits = with_lags_of_sensors(best, ranking, fits, dict(runs), terms)
         best = best if quick else with_profiled_shape(best)
         best = refit_noise(best, noise_of_fit(best, declared), declared, settings.noise)
         best = best if quick else refit_input_hold(best, declared, fixed, settings.noise)
@@ -416,28 +426,3 @@ def _by_free_run(
         return best, ranking
     key = near[first].model.terms[-1].key
     return near[first], tuple(sorted(ranking, key=lambda rival: (terms[rival.number].key != key, rival.gap)))
-
-
-def _by_own_noise(
-    base: FittedModel,
-    ranking: tuple[Ranked, ...],
-    chosen: Sequence[int],
-    fits: Sequence[FittedModel],
-    terms: tuple[Term, ...],
-    prefer: ModelPrior,
-    settings: Settings,
-) -> tuple[FittedModel, tuple[Ranked, ...]]:
-    """Return the most likely fit, and the ranking by distance to it; candidates that were not fitted come last."""
-    scores = [prefer.score_with_shape(fit, base) + (priced(fit, settings) - fit.log_likelihood) for fit in fits]
-    best = in_order(scores, [fit.model.terms[-1] for fit in fits])[0]
-    behind: dict[Key, tuple[float, int]] = {}
-    for number, score in zip(chosen, scores, strict=True):
-        key, gap = terms[number].key, scores[best] - score
-        behind[key] = min((gap, number), behind.get(key, (gap, number)))
-    last = max(gap for gap, _ in behind.values())
-    moved = []
-    for rival in ranking:
-        key = terms[rival.number].key
-        gap, number = behind.get(key, (max(last, rival.gap), rival.number))
-        moved.append(replace(rival, number=number, gap=gap))
-    return fits[best], tuple(sorted(moved, key=lambda rival: rival.gap))
