@@ -143,6 +143,7 @@ def test_a_candidate_that_enlarges_the_open_loop_residual_is_replaced_by_the_nex
     monkeypatch.setattr(stepwise, "_accept", accept)
     monkeypatch.setattr(stepwise, "_with_another", lambda _, after, *__: after)
     monkeypatch.setattr(stepwise, "_is_screened_out", lambda *_: False)
+    monkeypatch.setattr(stepwise, "is_hardly_visible", lambda _: False)
     monkeypatch.setattr(stepwise, "enlarges_open_loop", lambda fit, _: fit in refused)
     before = steps.StepwiseSearch(None, (known,), None, None, (), terms)
     after = stepwise.next_step(before, SimpleNamespace(level=0.05, quick=False), torch.Generator())
@@ -173,13 +174,24 @@ def test_two_jointly_needless_findings_end_the_search(monkeypatch):
     assert (after.found, after.evidence, after.pairs, after.left) == ((), ("without",), (), ())
 
 
-def test_a_refused_candidate_is_reported_with_its_reason(recording):
+@pytest.mark.parametrize(("hidden", "reason"), [(False, "open-loop residual is larger"), (True, "changes its length")])
+def test_a_refused_candidate_is_reported_with_its_reason(recording, monkeypatch, hidden, reason):
+    monkeypatch.setattr(search_notes, "is_hardly_visible", lambda _: hidden)
     (term, *_) = candidate_terms(Sled().prepare(recording), (), EFFECTS)
-    located, other = SimpleNamespace(term=term, p_value=0.01), SimpleNamespace(effect="another")
-    warning = search_notes._enlarging(located, SimpleNamespace(findings=(other,), quick=False))
+    located, other = SimpleNamespace(term=term, fit=None, p_value=0.01), SimpleNamespace(effect="another")
+    warning = search_notes._refused(located, SimpleNamespace(findings=(other,), quick=False))
     assert term.effect.id in warning
     assert f"at the {term.port}" not in warning
-    assert "p = 0.01 after the whole search, but the open-loop residual is larger with it" in warning
+    assert "p = 0.01 after the whole search" in warning
+    assert reason in warning
+
+
+def test_a_first_candidate_that_is_hardly_visible_is_refused(monkeypatch):
+    monkeypatch.setattr(stepwise, "is_hardly_visible", lambda _: True)
+    located = SimpleNamespace(p_value=0.01, fit=None)
+    search = steps.StepwiseSearch(None, (), None, None, (), ("left",))
+    after = stepwise._add(search, None, located, SimpleNamespace(level=0.05))
+    assert (after.found, after.refused, after.left) == ((), (located,), ())
 
 
 def test_a_refused_candidate_with_the_name_of_a_finding_has_its_port(recording):

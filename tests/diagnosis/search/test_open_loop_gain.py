@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from mkc_torch.diagnosis.search.ranking import (
     Ranked,
     enlarges_open_loop,
     improves_open_loop,
+    with_lags_of_sensors,
     with_open_loop_gain,
 )
 from tests.diagnosis.search.test_free_runs import DRAG, all_terms, free_fit
@@ -86,3 +88,31 @@ def test_a_stretch_that_a_fit_rejects_counts_in_the_open_loop_residual(ratio, la
         )
         is larger
     )
+
+
+def stub(effect_id, likelihood=0.0, *, remembers=True, port="output"):
+    effect = SimpleNamespace(remembers=remembers)
+    term = SimpleNamespace(effect=effect, key=(effect_id, (), port))
+    return SimpleNamespace(model=SimpleNamespace(terms=(term,)), log_likelihood=likelihood)
+
+
+@pytest.mark.parametrize(
+    ("remembers", "port", "nearer"), [(True, "output", True), (False, "output", False), (True, "input u", False)]
+)
+def test_a_lag_of_a_sensor_is_as_far_behind_as_in_the_open_loop(remembers, port, nearer):
+    """The filter puts it 160 nats behind the lag of the actuator, the open loop 0.5."""
+    first, rival = stub("input_lag", 590.0, port="input u"), stub("rival", 430.0, remembers=remembers, port=port)
+    runs = {0: stub("input_lag", -88.0, port="input u"), 1: stub("rival", -88.5, remembers=remembers, port=port)}
+    terms = tuple(fit.model.terms[-1] for fit in (first, rival, stub("other")))
+    ranking = (Ranked(0, 600.0, 0.0), Ranked(2, 500.0, 100.0), Ranked(1, 440.0, 160.0))
+    moved, fits = with_lags_of_sensors(first, ranking, (first, rival), runs, terms)
+    expected = [(0, 0.0), (1, 0.5), (2, 100.0)] if nearer else [(0, 0.0), (2, 100.0), (1, 160.0)]
+    assert [(place.number, place.gap) for place in moved] == expected
+    assert fits == (first, runs[1] if nearer else rival)
+
+
+def test_lags_stay_where_the_open_loop_of_the_first_is_unknown():
+    first, rival = stub("constant_force", 590.0, port="rate of x"), stub("sensor_lag", 430.0)
+    terms = (first.model.terms[-1], rival.model.terms[-1])
+    ranking = (Ranked(0, 600.0, 0.0), Ranked(1, 440.0, 160.0))
+    assert with_lags_of_sensors(first, ranking, (first, rival), {1: rival}, terms) == (ranking, (first, rival))
