@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import torch
 
 from mkc_torch.diagnosis.evidence.common_cause import course_without, located_cause
-from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out, on_all
+from mkc_torch.diagnosis.evidence.held_out import (
+    Evidence,
+    HeldOutBlocks,
+    better_supported,
+    blocks_of,
+    gain_interval,
+    held_out,
+    on_all,
+)
 from mkc_torch.diagnosis.findings.finding import ended_shapes
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
@@ -34,7 +42,7 @@ from mkc_torch.diagnosis.pipeline.simpler_form import (
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch, eliminated, exchanged, with_fit
 from mkc_torch.diagnosis.search.own_noise import priced
 from mkc_torch.diagnosis.search.partner import is_undetermined, with_partner
-from mkc_torch.diagnosis.search.ranking import Ranked, alike, enlarges_open_loop, is_hardly_visible
+from mkc_torch.diagnosis.search.ranking import Ranked, enlarges_open_loop, is_hardly_visible, is_repeated, near_onset
 from mkc_torch.diagnosis.search.run import SearchResult, run_search, screening_p_value
 from mkc_torch.diagnosis.search.with_process_noise import search_with_process_noise
 from mkc_torch.diagnosis.settings import ConfirmationSettings, Settings
@@ -85,6 +93,8 @@ def first_step(
 ) -> StepwiseSearch:
     """Run the first search; its candidate is a finding if held-out blocks confirm it.
 
+    After a refused candidate the search is repeated once without its effect.
+
     ``keep`` is called with the search so far.
     """
     prepared = base.model.prepared
@@ -104,13 +114,16 @@ def first_step(
     keep(first_step)
     if first is None:
         return first_step
-    taken = _add(first_step, base, first, options)
+    taken = _add(first_step, base, first, options, lambda left: _located(base, left, options, generator, free=free))
     keep(taken)
     cause = None
-    if not taken.found and not options.quick:
-        cause = located_cause(base, first, options.level, options.surrogates)
+    if taken.first is not None and not taken.found and not options.quick:
+        cause = located_cause(base, taken.first, options.level, options.surrogates)
     if cause is not None:
-        after = held_out(cause.fit, blocks, partial(course_without, base, cause))
+        try:
+            after = held_out(cause.fit, blocks, partial(course_without, base, cause))
+        except NoFitError:  # without a part of the recording there is no such course
+            return taken
         # after a free course, little structure remains
         return replace(_accept(replace(taken, first=cause), base, cause, options, after), left=())
     return _with_another(first_step, taken, options, generator, free) if taken.found else taken
@@ -121,29 +134,41 @@ def next_step(
 ) -> StepwiseSearch:
     """Run the next search with the findings in the model; skip it if the screening shows nothing.
 
-    After a candidate that enlarges the open-loop residual the search is repeated once without its effect.
+    After a refused candidate the search is repeated once without its effect.
     """
     if _is_screened_out(search, options):
         return replace(search, left=())
     fit = search.found[-1].fit
     try:
         located = _located(fit, search.left, options, generator, parts=False)
-        taken = _add(search, fit, located, options)
-        left = tuple(term for term in search.left if term.key != located.term.key)
-        if taken.refused != search.refused and left:
-            located = _located(fit, left, options, generator, parts=False)
-            taken = _add(replace(search, refused=taken.refused), fit, located, options)
+        again = partial(_located, fit, options=options, generator=generator, parts=False)
+        taken = _add(search, fit, located, options, again)
         keep(taken)
         return _with_another(search, taken, options, generator)
     except NoFitError as error:
         return replace(search, left=(), given_up=str(error))  # keep the previous findings
 
 
-def _add(search: StepwiseSearch, fit: FittedModel, located: SearchResult, options: SearchOptions) -> StepwiseSearch:
-    """Add a located candidate if it counts as a finding, is visible, and does not enlarge the open-loop residual."""
+def _add(
+    search: StepwiseSearch,
+    fit: FittedModel,
+    located: SearchResult,
+    options: SearchOptions,
+    again: Callable[[tuple[Term, ...]], SearchResult] | None = None,
+) -> StepwiseSearch:
+    """Add a located candidate if it counts as a finding, is visible, and does not enlarge the open-loop residual.
+
+    ``again`` searches once more, without the effect of a refused candidate.
+    """
     spoils = is_hardly_visible(located.fit) or (bool(search.found) and enlarges_open_loop(located.fit, fit))
     if located.p_value <= options.level and spoils:
-        return replace(search, left=(), refused=(*search.refused, located))
+        less = replace(search, left=(), refused=(*search.refused, located))
+        left = tuple(term for term in search.left if term.key != located.term.key)
+        if again is None or not left:
+            return less
+        further = again(left)
+        less = replace(less, left=search.left, first=search.first if search.found else further)
+        return _add(less, fit, further, options)
     try:
         return _accept(search, fit, located, options)
     except NoFitError:
@@ -201,8 +226,10 @@ def _is_screened_out(search: StepwiseSearch, options: SearchOptions) -> bool:
 def _further_p_value(search: StepwiseSearch, options: SearchOptions) -> float:
     """The p-value of the screening after the last finding."""
     last, settings = search.found[-1], options.settings
-    near = _near(last.fit, settings)
-    others = [all(not _same(term, known.term, near, settings) for known in search.found) for term in last.scene.terms]
+    near = near_onset(last.fit, settings)
+    others = [
+        all(not is_repeated(term, known.term, near, settings) for known in search.found) for term in last.scene.terms
+    ]
     generator = torch.Generator().manual_seed(options.seed)
     return screening_p_value(last, others, settings.confirmation.screening_draws, generator, quick=options.quick)
 
@@ -255,11 +282,11 @@ def _accept(
             first=not search.found,
         )
 
-    same = None if located.with_noise else _under_the_same(previous, located.fit)
+    same = None if located.with_noise else _under_theis_repeated(previous, located.fit)
     paired = (
         after
         if same is None
-        else _better_supported(before, (held_out(same, search.blocks), after), search.blocks, options.seed)
+        else better_supported(before, (held_out(same, search.blocks), after), search.blocks, options.seed)
     )
     if within_a_sample(located.term, located.fit.model.prepared) or not holds(located.fit, paired):
         return replace(over, unconfirmed=located)
@@ -274,9 +301,9 @@ def _accept(
     paired = simpler if same is None or fit is not located.fit else paired
     after = simpler
     found = (*search.found, replace(located, fit=fit, term=fit.model.terms[-1]))
-    near = _near(located.fit, options.settings)
+    near = near_onset(located.fit, options.settings)
     known = (located.term, *fit.model.terms)  # a simpler form may have replaced the located effect
-    left = tuple(t for t in search.left if not any(_same(t, own, near, options.settings) for own in known))
+    left = tuple(t for t in search.left if not any(is_repeated(t, own, near, options.settings) for own in known))
     pairs = (*search.pairs, (before, paired))
     taken = replace(search, found=found, evidence=(*search.evidence, after), pairs=pairs, left=left)
     if located.with_noise:
@@ -403,21 +430,7 @@ def _score(fit: FittedModel, settings: Settings) -> float:
     return priced(fit, settings) - 0.5 * math.log(len(fit.residual)) * _numbers(fit)
 
 
-def _better_supported(before: Evidence, ways: Sequence[Evidence], blocks: HeldOutBlocks, seed: int) -> Evidence:
-    """Return the evidence with the larger lower limit of the gain.
-
-    The finding is tested under the process noise of the model without it, and under the process noise that remains with
-    it. The first noise absorbs as much of the finding as it can; under the second, few samples can dominate.
-    """
-
-    def least(after: Evidence) -> float:
-        difference = after.log_likelihood - before.log_likelihood
-        return gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))[1][0]
-
-    return max(ways, key=least)
-
-
-def _under_the_same(previous: FittedModel, fit: FittedModel) -> FittedModel | None:
+def _under_theis_repeated(previous: FittedModel, fit: FittedModel) -> FittedModel | None:
     """Refit a finding under the process noise of the fit without it, for comparison; None if the noise is equal."""
     if not has_process_noise(previous) or fit.model.prepared is previous.model.prepared:
         return None
@@ -426,24 +439,3 @@ def _under_the_same(previous: FittedModel, fit: FittedModel) -> FittedModel | No
         return fitted(model, fit.parameters, previous.bound, graduate=False)
     except NoFitError:
         return None
-
-
-def _near(fit: FittedModel, settings: Settings) -> float:
-    """Seconds within which two steps count as the same step."""
-    time = fit.model.prepared.time
-    return settings.confirmation.near * float(time[-1] - time[0])
-
-
-def _same(term: Term, found: Term, near: float, settings: Settings) -> bool:
-    """Whether a candidate repeats the found effect, or is a curve over its driver.
-
-    A step more than ``near`` seconds away is another step; a closer step would only correct the shape of the first.
-    """
-    if "onset" in term.shape and "onset" in found.shape:
-        return abs(term.shape["onset"] - found.shape["onset"]) < near
-    if term.key == found.key or (term.effect.is_curve and term.columns == found.columns):
-        return True
-    # a column that correlates with a found driver would only share its amplitude
-    if term.driver is None or found.driver is None:
-        return False
-    return alike(term.driver, found.driver) > settings.naming.alike_columns

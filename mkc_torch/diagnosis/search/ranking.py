@@ -356,3 +356,24 @@ def _open_loop_size(fit: FittedModel, known: Mapping[Key, FittedModel]) -> float
 def _size(fit: FittedModel) -> float:
     """Mean over the outputs of the log size of the residual."""
     return float(size_of(fit.residual).log().mean())
+
+
+def near_onset(fit: FittedModel, settings: Settings) -> float:
+    """Seconds within which two steps count as the same step."""
+    time = fit.model.prepared.time
+    return settings.confirmation.near * float(time[-1] - time[0])
+
+
+def is_repeated(term: Term, found: Term, near: float, settings: Settings) -> bool:
+    """Whether a candidate repeats the found effect, or is a curve over its driver.
+
+    A step more than ``near`` seconds away is another step; a closer step would only correct the shape of the first.
+    """
+    if "onset" in term.shape and "onset" in found.shape:
+        return abs(term.shape["onset"] - found.shape["onset"]) < near
+    if term.key == found.key or (term.effect.is_curve and term.columns == found.columns):
+        return True
+    # a column that correlates with a found driver would only share its amplitude
+    if term.driver is None or found.driver is None:
+        return False
+    return alike(term.driver, found.driver) > settings.naming.alike_columns

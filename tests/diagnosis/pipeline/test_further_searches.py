@@ -188,10 +188,19 @@ def test_a_refused_candidate_is_reported_with_its_reason(recording, monkeypatch,
 
 def test_a_first_candidate_that_is_hardly_visible_is_refused(monkeypatch):
     monkeypatch.setattr(stepwise, "is_hardly_visible", lambda _: True)
-    located = SimpleNamespace(p_value=0.01, fit=None)
-    search = steps.StepwiseSearch(None, (), None, None, (), ("left",))
-    after = stepwise._add(search, None, located, SimpleNamespace(level=0.05))
-    assert (after.found, after.refused, after.left) == ((), (located,), ())
+    located, further = (
+        SimpleNamespace(p_value=p, fit=None, term=SimpleNamespace(key=key))
+        for p, key in ((0.01, "step"), (0.8, "drift"))
+    )
+    terms = (located.term, further.term)
+    monkeypatch.setattr(stepwise, "_accept", lambda search, *_: replace(search, left=()))
+    search = steps.StepwiseSearch(located, (), None, None, (), terms)
+    searched = []
+    after = stepwise._add(
+        search, None, located, SimpleNamespace(level=0.05), lambda left: searched.append(left) or further
+    )
+    assert searched == [(further.term,)]
+    assert (after.found, after.refused, after.left, after.first) == ((), (located,), (), further)
 
 
 def test_a_refused_candidate_with_the_name_of_a_finding_has_its_port(recording):
