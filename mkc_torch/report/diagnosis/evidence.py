@@ -10,6 +10,9 @@ from typing import Any
 from mkc_torch._support.typesetting import typeset
 from mkc_torch.diagnosis.result import DensityCheck, DriverShift, EvidenceResult, Extrapolation
 
+_FAR = 1000
+"""Nats per sample beyond which no exact gain is shown: one of the models leaves the domain of the density."""
+
 _DRIVEN_BY = "driven by"
 """Label of rows that are shown with the driver's name."""
 
@@ -103,7 +106,11 @@ def _gain(extrapolation: Extrapolation) -> str:
     Example:
         >>> _gain(Extrapolation(-0.0212, (-0.12, 0.09)))
         '-0.021 nats per sample (95 %: -0.120 to 0.090)'
+        >>> _gain(Extrapolation(3e6, (4.0, 9e6)))
+        'more than +1000 nats per sample'
     """
+    if abs(extrapolation.log_likelihood_gain) > _FAR:
+        return f"{'more than +' if extrapolation.log_likelihood_gain > 0.0 else 'less than -'}{_FAR} nats per sample"
     low, high = extrapolation.confidence_interval
     places = max(1 - math.floor(math.log10(0.25 * (high - low))), 0) if high > low else 3
     gain, low, high = (round(value, places) + 0.0 for value in (extrapolation.log_likelihood_gain, low, high))
