@@ -43,9 +43,11 @@ def test_a_rate_by_hand():
 
 
 def test_kinds_of_noise_add_to_the_same_recording():
-    white, slow, pushed = (recording(HiddenCause(EMPTY), noise, 2)["temp"] for noise in ("white", "slow", "pushed"))
+    white, slow, disturbed = (
+        recording(HiddenCause(EMPTY), noise, 2)["temp"] for noise in ("white", "slow", "disturbed")
+    )
     assert 0.05 < float((slow - white).std()) < 0.2
-    assert float((pushed - white).std()) > 0.2
+    assert float((disturbed - white).std()) > 0.2
 
 
 def test_the_table_counts_names_and_wrong_columns():

@@ -37,7 +37,7 @@ EMPTY = "nothing"
 COLUMN_OF = {"driver_exchange": "temperature_cellar", "driver_input_gain": "supply"}
 """The column that acts; for the other effects it is the sun or the wind."""
 
-NOISES = ("white", "slow", "pushed")
+NOISES = ("white", "slow", "disturbed")
 """Kinds of noise, in turn: white sensor noise alone, a slow sensor error, or process noise."""
 
 _UNITS = {"temp": "°C", "ambient": "°C", "temperature_cellar": "°C"}
@@ -128,8 +128,8 @@ def recording(cause: HiddenCause, noise: str, seed: int) -> Recording:
         "supply": 24.0 + smooth(g, 80.0),
     }
     means = {name: float(values.mean()) for name, values in columns.items()}
-    push = 0.04 * smooth(g, 15.0) if noise == "pushed" else torch.zeros(SAMPLES, dtype=torch.float64)
-    table = {name: values.tolist() for name, values in (columns | {"push": push}).items()}
+    disturbance = 0.04 * smooth(g, 15.0) if noise == "disturbed" else torch.zeros(SAMPLES, dtype=torch.float64)
+    table = {name: values.tolist() for name, values in (columns | {"disturbance": disturbance}).items()}
     temp = [14.0]
     for k in range(SAMPLES - 1):
         value = temp[-1]
@@ -137,7 +137,7 @@ def recording(cause: HiddenCause, noise: str, seed: int) -> Recording:
             at = (part + 0.5) / FINE
             now = {name: values[k] + at * (values[k + 1] - values[k]) for name, values in table.items()}
             now["heat"] = table["heat"][k]
-            value += STEP / FINE * (cause.rate(value, now, means) + now["push"])
+            value += STEP / FINE * (cause.rate(value, now, means) + now["disturbance"])
         temp.append(value)
     error = 0.05 * torch.randn(SAMPLES, generator=g, dtype=torch.float64)
     if noise == "slow":

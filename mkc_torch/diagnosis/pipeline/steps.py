@@ -103,7 +103,7 @@ def exchanged(search: StepwiseSearch, further: SearchResult, options: SearchOpti
 
 
 def revised(search: StepwiseSearch, options: SearchOptions) -> StepwiseSearch:
-    """Replace earlier findings by rivals of their searches that are clearly more likely beside the other findings.
+    """Replace earlier findings by rivals of their searches that are clearly more likely with the other findings.
 
     An earlier finding was chosen while the later ones were missing, and may stand for a part of them.
     """

@@ -160,8 +160,8 @@ def _add(
 
     ``again`` searches once more, without the effect of a refused candidate.
     """
-    spoils = is_hardly_visible(located.fit) or (bool(search.found) and enlarges_open_loop(located.fit, fit))
-    if located.p_value <= options.level and spoils:
+    refused = is_hardly_visible(located.fit) or (bool(search.found) and enlarges_open_loop(located.fit, fit))
+    if located.p_value <= options.level and refused:
         less = replace(search, left=(), refused=(*search.refused, located))
         left = tuple(term for term in search.left if term.key != located.term.key)
         if again is None or not left:

@@ -332,8 +332,8 @@ def enlarges_open_loop(fit: FittedModel, less: FittedModel) -> bool:
 def is_hardly_visible(fit: FittedModel) -> bool:
     """Whether the last effect moves a sensor's vector far more than the compared length of the vector.
 
-    An offset can mirror all later vectors with nearly the same length. Such a fit says little of the offset, and spoils
-    every vector that it corrects. False where each component of the vector is compared.
+    An offset can mirror all later vectors with nearly the same length. Such a fit does not determine the offset, and
+    makes every vector that it corrects wrong. False where each component of the vector is compared.
     """
     model, term = fit.model, fit.model.terms[-1]
     port = model.prepared.ports[term.port]

@@ -64,6 +64,10 @@ NEVER_HIDDEN = {
     "driver_linear": "no plant has a driver that is recorded and is no input",
     "driver_quadratic": "as for the linear one",
     "driver_gain": "as for the linear one",
+    "driver_force": "as for the linear one; hidden by `tests.gate.recorded_causes`",
+    "driver_exchange": "as for the force",
+    "driver_rate_constant": "as for the force",
+    "driver_input_gain": "as for the force",
     "gain_drift": "no plant's sensor ages",
 }
 """Effects of the catalogue that no plant could show, and why."""

@@ -1,4 +1,4 @@
-"""Earlier findings are compared again with their rivals beside the later findings."""
+"""Earlier findings are compared again with their rivals, with the later findings in the model."""
 
 from types import SimpleNamespace
 

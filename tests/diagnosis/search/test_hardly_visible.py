@@ -47,10 +47,10 @@ def test_an_offset_is_visible_in_the_length(change):
     assert not is_hardly_visible(with_step(change))
 
 
-@pytest.mark.parametrize("aside", [0.0, 0.4, 1.0])
-def test_a_mirror_of_the_later_vectors_is_hardly_visible(aside):
+@pytest.mark.parametrize("tilt", [0.0, 0.4, 1.0])
+def test_a_mirror_of_the_later_vectors_is_hardly_visible(tilt):
     """The vectors after the onset are mirrored at a plane, whose normal may be turned away from the field."""
-    normal = LAST + aside * torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    normal = LAST + tilt * torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     normal = normal / normal.norm()
     change = 2.0 * FIELD * (LAST @ normal) * normal
     assert float(change.norm()) > 0.5 * FIELD
