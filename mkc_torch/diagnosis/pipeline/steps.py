@@ -117,10 +117,13 @@ def revised(search: StepwiseSearch, options: SearchOptions) -> StepwiseSearch:
 def _with_better_rival(search: StepwiseSearch, finding: SearchResult, options: SearchOptions) -> StepwiseSearch | None:
     """Replace a finding by its most likely rival; None if that is not clearly more likely.
 
-    The rivals start from the open loop: a fit under the remaining noise would keep to the finding's parameters.
+    All start from the open loop: a fit under the remaining noise would keep to the finding's parameters. The rival has
+    to gain twice the limit of separability, because the finding has passed a search of its own.
     """
     final, settings = search.found[-1].fit, options.settings
     number = next(n for n, known in enumerate(search.found) if known.term.key == finding.term.key)
+    anew = None if final.open_loop is None else _under_own_noise(final.open_loop, options)
+    least = max(_score(fit, number, settings) for fit in (final, anew) if fit is not None)
     free = refit_open_loop(without_term(final, number))
     keys = {known.term.key for known in search.found}
     terms = [term for term in finding.scene.terms if term.key not in keys]
@@ -129,7 +132,7 @@ def _with_better_rival(search: StepwiseSearch, finding: SearchResult, options: S
     works = [partial(_under_own_noise, run, options) for _, run in free_runs(free, terms, settings).fits]
     fits = [fit for fit in run_parallel(works, free.model.prepared, terms) if fit is not None]
     best = max(fits, key=lambda fit: _score(fit, -1, settings), default=None)
-    if best is None or _score(best, -1, settings) < _score(final, number, settings) + settings.naming.separable:
+    if best is None or _score(best, -1, settings) < least + 2.0 * settings.naming.separable:
         return None
     kept = tuple(known for n, known in enumerate(search.found) if n != number)
     return with_fit(search, (*kept, replace(finding, term=best.model.terms[-1])), best, options)
