@@ -122,8 +122,8 @@ def _with_better_rival(search: StepwiseSearch, finding: SearchResult, options: S
     """
     final, settings = search.found[-1].fit, options.settings
     number = next(n for n, known in enumerate(search.found) if known.term.key == finding.term.key)
-    anew = None if final.open_loop is None else _under_own_noise(final.open_loop, options)
-    least = max(_score(fit, number, settings) for fit in (final, anew) if fit is not None)
+    again = None if final.open_loop is None else _under_own_noise(final.open_loop, options)
+    least = max(_score(fit, number, settings) for fit in (final, again) if fit is not None)
     free = refit_open_loop(without_term(final, number))
     keys = {known.term.key for known in search.found}
     terms = [term for term in finding.scene.terms if term.key not in keys]
