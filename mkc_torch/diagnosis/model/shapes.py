@@ -29,6 +29,9 @@ _STEPS = 8
 _FACTORS = (0.5, 0.71, 0.84, 0.92, 1.09, 1.19, 1.41, 2.0)
 """Factors by which a delay or a lag is varied in each round."""
 
+_REPEATED = 0.9
+"""Absolute correlation with an input above which a column counts as that input, as in ``alike_columns``."""
+
 _LEADING = 2
 """Number of the most likely variants whose shape is fitted in each round."""
 
@@ -44,6 +47,7 @@ def candidate_terms(
 ) -> tuple[Term, ...]:
     """Return each effect that has a port in the simulation, with each of its drivers and each shape of its grid."""
     terms = []
+    own = {driver.columns for driver in drivers if not _repeats_an_input(driver, prepared)}
     for effect in effects:
         places = [name for name, port in prepared.ports.items() if _fits(effect, name, port)]
         # an effect without roles, or with an optional driver, is also tried without a driver
@@ -54,9 +58,22 @@ def candidate_terms(
             Term(effect, driver, shape, "" if at == effect.port else at)
             for at in places
             for driver in fitting
+            if driver is None or driver.columns in own or prepared.ports[at].clock is None
             for shape in (absolute(effect, shape, prepared.ports[at], driver) for shape in shapes)
         ]
     return tuple(term for term in terms if not within_a_sample(term, prepared))
+
+
+def _repeats_an_input(driver: Driver, prepared: PreparedSimulation) -> bool:
+    """Whether a column nearly repeats an input: it would act where the input acts, and repair a wrong simulation."""
+    inputs = [name.removeprefix("input ") for name, port in prepared.ports.items() if port.kind == "input"]
+    table = [prepared.recording[name] for name in inputs if name in prepared.recording]
+    if not table or driver.values.shape[1] != 1:
+        return False
+    away = torch.stack(table) - torch.stack(table).mean(-1, keepdim=True)
+    away = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True).clamp(min=1e-300)
+    column = driver.values[:, 0] / torch.linalg.vector_norm(driver.values)
+    return bool(((away @ column).abs() > _REPEATED).any())
 
 
 def within_a_sample(term: Term, prepared: PreparedSimulation) -> bool:

@@ -91,9 +91,9 @@ def recording():
     return Recording({**columns, "sun": (2.0 * time).cos(), "temperature_cellar": 9.0 + (0.7 * time).sin()})
 
 
-def tried(simulation):
+def tried(simulation, known=None):
     """Return effect, column and port of each candidate that a column drives at a rate or an input."""
-    known = recording()
+    known = recording() if known is None else known
     prepared = simulation.prepare(known)
     drivers = find_drivers(known, frozenset(simulation.columns), DriverSettings()).drivers
     terms = candidate_terms(prepared, drivers, (*DYNAMICS, *PAIRED))
@@ -114,3 +114,12 @@ def test_columns_act_on_rates_and_actuators_but_not_on_the_surroundings():
 
 def test_a_static_simulation_has_the_gain_of_its_output_instead():
     assert tried(Line()) == set()
+
+
+@pytest.mark.parametrize(("noise", "acts"), [(0.1, False), (3.0, True)])
+def test_a_column_that_nearly_repeats_an_input_acts_on_no_rate(noise, acts):
+    known = recording()
+    g = torch.Generator().manual_seed(1)
+    copied = known["power"] + noise * torch.randn(60, generator=g, dtype=torch.float64)
+    columns = {name: known[name] for name in ("time", "power", "outside", "temp")}
+    assert bool(tried(Room(), Recording({**columns, "measured": copied}))) is acts
