@@ -176,6 +176,35 @@ def _simulated(folder: Path) -> Iterator[Known]:
     yield _known(folder, "simulated/held_input", "run.csv", "UpsideDown", Expected(verdicts=unfit))
 
 
+def strangers(shared: Path = SHARED) -> Iterator[Known]:
+    """Recordings that the project had not seen when they were tried first, in a folder like :data:`SHARED`.
+
+    The residuals are 1.15 times that of a fit by hand with as many effects.
+    """
+    folder = shared / "cases" / "strangers"
+
+    def stranger(name: str, simulation: str, expected: Expected) -> Known:
+        file = f"{folder / name / 'naive.py'}:{simulation}"
+        return Known(f"strangers {name}", folder / name / "run.csv", file, expected)
+
+    friction = Expected((("coulomb_friction",),), residual={"angle": 1.15 * 0.0139})
+    yield stranger("motor_pendulum", "Pendulum", friction)
+    thrust = Expected((("input_square", "power_law"), ("coulomb_friction",)), residual={"angle": 1.15 * 0.0400})
+    yield stranger("quarter_drone", "Arm", thrust)
+    polarisation = Expected((("input_lag", HIDDEN_STORE),), residual={"voltage": 1.15 * 0.00383})
+    yield stranger("battery_cell", "Cell", polarisation)
+    drain = Expected((("overflow",),), refused=("backlash",), residual={"head": 1.15 * 0.0839})
+    yield stranger("groundwater_threshold", "Head", drain)
+    yield stranger("cogging_motor", "Motor", Expected((("coulomb_friction",), ("position_periodic_force",))))
+    tilted = Expected((("constant_force",), ("coulomb_friction", "stribeck_friction")), verdicts=USEFUL)
+    yield stranger("tilted_cart", "Cart", tilted)
+    yield stranger("fast_clock", "Stage", Expected(verdicts=("unexplained",)))
+    yield stranger("wrong_sign", "Pendulum", Expected(verdicts=("unfit", "unexplained")))
+    yield stranger("sagging_battery", "Quad", Expected((("driver_input_gain",),), verdicts=USEFUL))
+    # the temperature acts on the resistance, which no effect of the catalogue reaches
+    yield stranger("warm_cell", "Cell", Expected(refused=("driver_input_gain",), verdicts=("unexplained",)))
+
+
 def data(shared: Path = SHARED) -> Iterator[Known]:
     """Public recordings with known missing physics that are read as they are, in a folder like :data:`SHARED`."""
     folder = shared / "data"

@@ -1,6 +1,6 @@
 """The gate for changes of the verdict: `python -m tests.gate --output DIR [--compare STORED.json]`.
 
-Diagnoses the real recordings and cases next to the repository, a few recordings of each scenario, and small draws of
+Diagnoses the real recordings, cases and strangers' recordings next to the repository, a few recordings of each scenario, and small draws of
 both proofs. The draws are the same in every run. Writes `DIR/gate.json`: for each recording the verdict, findings,
 residuals, CPU and wall seconds, and whether it is right. Prints the counts and the recordings that are not right; with
 `--compare`, also the differences from a stored `gate.json`.
@@ -32,8 +32,11 @@ from tests.gate.compare import differences
 from tests.gate.tables import compared_lines, count_lines, wrong_lines
 from tests.gate.work import Job, diagnosed
 
-PARTS = ("real", "cases", "scenarios", "proofs")
+PARTS = ("real", "cases", "strangers", "scenarios", "proofs")
 RESULT = "gate.json"
+
+_KNOWN = {"real": known.real, "cases": known.cases, "strangers": known.strangers}
+"""Recordings with right answers, by part of the gate."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -84,7 +87,7 @@ def run(
         _write(output, {"recordings": rows})
     counts: dict[str, dict[str, str]] = {
         part: {"right": _right([row for name, row in rows.items() if name.startswith(f"{part} ")])}
-        for part in ("real", "cases")
+        for part in _KNOWN
         if part in parts
     }
     for group in draws.values():
@@ -100,7 +103,7 @@ def run(
 
 
 def _known(parts: Sequence[str]) -> Iterator[known.Known]:
-    for part, recordings in (("real", known.real), ("cases", known.cases)):
+    for part, recordings in _KNOWN.items():
         for answer in recordings() if part in parts else ():
             absent = [str(file) for file in (answer.recording, answer.file) if not file.exists()]
             if absent:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _CLIP = 4.0
 """Standard deviations at which an innovation is clipped."""
 
-_OUTLIERS = 0.05
+OUTLIERS = 0.05
 """Share of outliers among the innovations."""
 
 _SCALINGS = 100
@@ -371,7 +371,7 @@ def robust_likelihood(
     used = counts > 0
     square = np.square(found.standard.swapaxes(2, 3)[used].T)  # (B, samples that count)
     spread = found.log_spread.swapaxes(2, 3)[used].T
-    tail = math.log(math.sqrt(0.5 * math.pi) * _OUTLIERS / (1.0 - _OUTLIERS)) - np.log(reach)
+    tail = math.log(math.sqrt(0.5 * math.pi) * OUTLIERS / (1.0 - OUTLIERS)) - np.log(reach)
     # log ratio of the outliers' density to the normal density at its mode
     odds = np.broadcast_to(tail, counts.shape)[used] + spread
     scale = np.maximum(np.sqrt(np.median(square, -1)) / 0.6745, _LEAST_SCALE) if free else np.ones(B)

@@ -1,0 +1,288 @@
+"""The score of a model of differential equations: the comparison of all models of one recording.
+
+    score = mean over horizons h of sum over samples k of log p(y[k] | y[..k-h]) - price
+
+A prediction is normal or, with a probability of 5 %, uniform over the output's span. Every density sums to 1 and the
+weights of the horizons do too, so the score is proper: in expectation no model scores higher than the true one. With
+white sensor noise alone all horizons are the free run, and the score is the ordinary log-likelihood. Process noise of
+any size can follow a recording one sample ahead; further ahead it has to pay with wide predictions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mkc_torch._support.quantum import rounding_of
+from mkc_torch.diagnosis.goodness_of_fit import size_of
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
+from mkc_torch.simulation.dynamics.horizons import horizons_of, log_likelihood_ahead, per_sample
+from mkc_torch.simulation.dynamics.kalman import Flow
+from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid, key_of
+from mkc_torch.simulation.dynamics.noise_model import NoiseModel
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+_DECADES = (0.5, 0.25, 0.12)
+"""Decades by which the sizes and times of the most likely noise are varied, round by round."""
+
+_ROUNDS = 3
+"""Steps of each round."""
+
+_SETTLED = 0.05
+"""Nats that a step has to gain for another."""
+
+
+@dataclass(frozen=True)
+class ScoreBasis:
+    """What all scores of a recording share, fixed before the search.
+
+    Attributes:
+        horizons: of the predictions, in samples.
+        span: (m,), range of each output.
+        counts: (N, m), mask of the samples.
+        samples: number of samples N, of which half the logarithm is the price of a number.
+        kappa: ratio of the long-run to the naive variance of the samples' scores, at least 1; it multiplies the price.
+        choice: nats for the choice of an effect, the logarithm of the number of candidates.
+        rounding: smallest white noise of each output.
+        declared: known standard deviations of the outputs' white noise, by output.
+    """
+
+    horizons: tuple[int, ...]
+    span: Float[np.ndarray, " m"]
+    counts: Float[np.ndarray, "N m"]
+    samples: int
+    kappa: float
+    choice: float
+    rounding: tuple[float, ...]
+    declared: Mapping[str, float]
+
+    @property
+    def number(self) -> float:
+        """Price of a fitted number in nats (Schwarz, Annals of Statistics 6 (1978), 461; Varin & Vidoni, Biometrika 92
+        (2005), 519, for likelihoods whose terms are not independent)."""
+        return 0.5 * self.kappa * math.log(self.samples)
+
+
+@dataclass(frozen=True)
+class Score:
+    """The score of a model and its parts, in nats.
+
+    Attributes:
+        by_horizon: log-likelihood of the recording from predictions over each horizon.
+        numbers: price of the fitted numbers of effects and noise.
+        terms: price of the choice of effects.
+        disturbances: price of the disturbances of the noise.
+        forms: price of forms that include others as special cases, and of curves without a name.
+        noise: the noise that scores best.
+        per_sample: (N,), log-likelihood of each sample, averaged over the horizons.
+    """
+
+    by_horizon: tuple[float, ...]
+    numbers: float
+    terms: float
+    disturbances: float
+    forms: float
+    noise: NoiseModel
+    per_sample: Float[np.ndarray, " N"]
+
+    @property
+    def log_likelihood(self) -> float:
+        """Mean over the horizons."""
+        return sum(self.by_horizon) / len(self.by_horizon)
+
+    @property
+    def value(self) -> float:
+        """The score."""
+        return self.log_likelihood - self.numbers - self.terms - self.disturbances - self.forms
+
+
+def basis_of(base: FittedModel, candidates: int, declared: Mapping[str, float], settings: Settings) -> ScoreBasis:
+    """Return what all scores of a recording share.
+
+    Args:
+        base: fit of the simulation without effects.
+        candidates: number of different effects, drivers and places that are searched.
+        declared: known standard deviations of the outputs' white noise, by output.
+        settings: thresholds.
+
+    Raises:
+        NoFitError: the fit has no finite trajectory.
+    """
+    prepared = base.model.prepared.dynamics
+    assert prepared is not None
+    flow = _flow(base)
+    measured = prepared.measured
+    span = (measured.amax(0) - measured.amin(0)).clamp(min=1e-300).double().cpu().numpy()
+    rounding = tuple(rounding_of(measured).tolist())
+    counts = prepared.counts.double().cpu().numpy()
+    choice = math.log(max(candidates, 1))
+    if flow is None:
+        return ScoreBasis((1,), span, counts, len(counts), 1.0, choice, rounding, declared)
+    basis = ScoreBasis(horizons_of(flow), span, counts, len(counts), 1.0, choice, rounding, declared)
+    alone = score(base, basis, settings)
+    return basis if alone is None else replace(basis, kappa=variance_ratio(alone.per_sample, basis.horizons[-1]))
+
+
+def variance_ratio(values: Float[np.ndarray, " N"], reach: int) -> float:
+    """Return the long-run variance over the variance of a series, at least 1.
+
+    Predictions over h samples overlap by h - 1, so their errors are correlated up to there. Newey & West, Econometrica
+    55 (1987), 703.
+
+    Args:
+        values: the series.
+        reach: largest lag, with Bartlett's weights.
+
+    Example:
+        >>> variance_ratio(np.array([1.0, -1.0] * 50), 3), variance_ratio(np.repeat([1.0, -1.0] * 25, 4), 3) > 2.0
+        (1.0, True)
+    """
+    away = values - values.mean()
+    power = float(away @ away)
+    if not power > 0.0:
+        return 1.0
+    lags = range(1, min(reach, len(away) - 1) + 1)
+    total = sum((1.0 - lag / (reach + 1)) * float(away[lag:] @ away[:-lag]) for lag in lags)
+    return max(1.0 + 2.0 * total / power, 1.0)
+
+
+def score(
+    fit: FittedModel, basis: ScoreBasis, settings: Settings, near: Sequence[NoiseModel] = ()
+) -> Score | None:
+    """Return the score of a fitted model under the noise that scores best; None if it loses the recording.
+
+    The parameters and sizes are those of the fit; noise is fitted here, on the same grid for all models.
+
+    Args:
+        fit: the model, in open loop or along an observer.
+        basis: what all scores of the recording share.
+        settings: thresholds.
+        near: further noise models to try.
+    """
+    flow = _flow(fit)
+    if flow is None:
+        return None
+    flow = replace(flow, counts=basis.counts)
+    models = [*_grid(fit, flow, basis).singles(), *near, *_own_noise(fit, basis)]
+    best = _best_noise(flow, models, basis, settings, _largest(fit), _grid(fit, flow, basis))
+    if best is None:
+        return None
+    noise, by_horizon = best
+    disturbances = len(noise.components)
+    numbers = sum(fit.model.sizes) + sum(len(term.effect.fitted_shape) for term in fit.model.terms)
+    forms = sum(
+        settings.naming.is_generalisation * term.effect.is_generalisation
+        + settings.naming.nameless * term.effect.is_curve
+        for term in fit.model.terms
+    )
+    return Score(
+        by_horizon,
+        basis.number * (numbers + _noise_numbers(noise)),
+        basis.choice * len(fit.model.terms),
+        settings.noise.disturbance_gain * disturbances,
+        forms,
+        noise,
+        per_sample(flow, noise, basis.horizons, basis.span),
+    )
+
+
+def _noise_numbers(noise: NoiseModel) -> int:
+    """Number of sizes and time constants of the disturbances."""
+    return sum(1 + (lasting > 0.0) for _, _, lasting in noise.components)
+
+
+def _flow(fit: FittedModel) -> Flow | None:
+    """Return the linearised trajectory of a fit; None without a finite one."""
+    model, prepared = fit.model, fit.model.prepared.dynamics
+    if prepared is None:
+        return None
+    flow = flow_of(prepared, fit.parameters[: model.base], model.changes(fit.parameters), model.near)
+    arrays = () if flow is None else (flow.transition, flow.seen, flow.new, flow.shift, flow.noise_input)
+    return flow if flow is not None and all(bool(np.isfinite(array).all()) for array in arrays) else None
+
+
+def _largest(fit: FittedModel) -> Float[np.ndarray, " p+m"]:
+    """Return the largest plausible disturbance of each rate and each output."""
+    prepared, model = fit.model.prepared.dynamics, fit.model
+    assert prepared is not None
+    return plausible_sizes(prepared, fit.parameters[: model.base], model.changes(fit.parameters), model.near)
+
+
+def _grid(fit: FittedModel, flow: Flow, basis: ScoreBasis) -> NoiseGrid:
+    """Return the grid of noise models around a fit's white noise."""
+    prepared = fit.model.prepared.dynamics
+    assert prepared is not None
+    observer = prepared.observer
+    size = size_of(fit.residual) if observer is None else observer.sensor
+    known = tuple(name in basis.declared for name in prepared.channels)
+    sensor = [
+        basis.declared.get(name, max(own, step, 1e-300))
+        for name, own, step in zip(prepared.channels, size.tolist(), basis.rounding, strict=True)
+    ]
+    return NoiseGrid(flow, NoiseModel(tuple(sensor), (), known, basis.rounding))
+
+
+def _own_noise(fit: FittedModel, basis: ScoreBasis) -> list[NoiseModel]:
+    """Return the noise that a fit was made under, if it has disturbances."""
+    prepared = fit.model.prepared.dynamics
+    if prepared is None or prepared.observer is None:
+        return []
+    observer, channels = prepared.observer, prepared.channels
+    known = tuple(name in basis.declared for name in channels)
+    rates = prepared.disturbable
+    return [
+        NoiseModel.of(observer.disturbances, observer.sensor.tolist(), rates, channels, known, basis.rounding)
+    ]
+
+
+def _best_noise(
+    flow: Flow,
+    models: Sequence[NoiseModel],
+    basis: ScoreBasis,
+    settings: Settings,
+    largest: Float[np.ndarray, " p+m"] | None,
+    grid: NoiseGrid | None = None,
+) -> tuple[NoiseModel, tuple[float, ...]] | None:
+    """Return the noise that scores best, refined on the grid, at its scale, and its log-likelihood by horizon."""
+
+    def evaluated(tried: Sequence[NoiseModel]) -> tuple[float, NoiseModel, tuple[float, ...]]:
+        values, scales = log_likelihood_ahead(flow, tried, basis.horizons, basis.span)
+        best: tuple[float, NoiseModel, tuple[float, ...]] = -math.inf, tried[0], ()
+        for noise, each, scale in zip(tried, values, scales, strict=True):
+            scaled = replace(
+                noise,
+                sensor=tuple(scale * size for size in noise.sensor),
+                components=tuple((place, scale * size, lasting) for place, size, lasting in noise.components),
+            )
+            if largest is not None and any(size > largest[place] for place, size, _ in scaled.components):
+                continue
+            price = settings.noise.disturbance_gain * len(noise.components) + basis.number * _noise_numbers(noise)
+            value = float(each.mean()) - price
+            if value > best[0]:
+                best = value, scaled, tuple(each.tolist())
+        return best
+
+    found = evaluated(models)
+    if not math.isfinite(found[0]):
+        return None
+    seen = {key_of(model) for model in models}
+    for decades in _DECADES if grid is not None else ():
+        for _ in range(_ROUNDS):
+            assert grid is not None
+            others = [model for model in grid.neighbours(found[1], decades) if key_of(model) not in seen]
+            if not others:
+                break
+            seen |= {key_of(model) for model in others}
+            better = evaluated(others)
+            if not better[0] > found[0] + _SETTLED:
+                break
+            found = better
+    return found[1], found[2]
