@@ -1,0 +1,287 @@
+"""Beam search over sets of effects: every model is fitted in open loop and compared by its score."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import torch
+
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted, fitted_with_effect, without_term
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise
+from mkc_torch.diagnosis.model.shapes import shape_fitted, with_form_of_grid
+from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
+from mkc_torch.diagnosis.score import Score, ScoreBasis, score
+from mkc_torch.diagnosis.search.moves import (
+    Addition,
+    additions,
+    in_other_orders,
+    special_cases,
+    with_wide_grid,
+)
+from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.nonlinear import NoFitError
+
+WIDTH = 6
+"""Models of the beam."""
+
+LEAST_WIDTH = 3
+"""Models that are expanded whatever their distance to the best."""
+
+MOST_TERMS = 5
+"""Largest number of effects of a model."""
+
+MOST_MODELS = 60
+"""Largest number of models of a recording."""
+
+_ADDITIONS = (12, 6, 4, 3, 3, 3)
+"""Number of effects that are tried in addition to the best model of the beam, the second, and so on."""
+
+_PAYS = 0.5
+"""Share of its price that an addition to a model with effects has to gain in the linearised model."""
+
+_NOISY = 3
+"""Number of leading models that are also fitted under their process noise."""
+
+ModelKey = tuple[tuple[Key, bool], ...]
+"""Identity of a model: its effects with their places in series, in a fixed order."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A fitted and scored model.
+
+    Attributes:
+        fit: in open loop, or along the simulation's observer if no open loop is found.
+        score: None where the model loses the recording.
+        move: how the search came to it.
+    """
+
+    fit: FittedModel
+    score: Score | None
+    move: str
+
+    @property
+    def value(self) -> float:
+        """The score in nats."""
+        return -float("inf") if self.score is None else self.score.value
+
+    @property
+    def key(self) -> ModelKey:
+        """Identity of the model."""
+        return model_key(self.fit.model.terms)
+
+
+def model_key(terms: Iterable[Term]) -> ModelKey:
+    """Return the identity of a model with these effects."""
+    return tuple(sorted((term.key, term.first) for term in terms))
+
+
+@dataclass
+class BeamSearch:
+    """The models of a recording, each fitted once.
+
+    Attributes:
+        terms: the candidates, with the shapes of their grids.
+        basis: what all scores share.
+        settings: thresholds.
+        declared: known standard deviations of the outputs' white noise.
+        models: the scored models by identity, in the order in which they were tried.
+    """
+
+    terms: tuple[Term, ...]
+    basis: ScoreBasis
+    settings: Settings
+    declared: Mapping[str, float]
+    models: dict[ModelKey, Candidate] = field(default_factory=dict)
+
+    def run(
+        self, start: FittedModel, further: Sequence[Term] = (), progress: Callable[[int], object] = lambda _: None
+    ) -> Candidate:
+        """Search from the simulation alone; return the model with the highest score.
+
+        Args:
+            start: the simulation alone, in open loop if that is found.
+            further: candidates that are tried first, such as the leaders of another screening.
+            progress: called with the number of models after each round.
+        """
+        self._keep([Candidate(start, score(start, self.basis, self.settings), "")])
+        terms = with_wide_grid(self.terms, start.model.prepared)
+        expanded: set[ModelKey] = set()
+        while len(self.models) < MOST_MODELS:
+            waiting = [(rank, model) for rank, model in enumerate(self.beam()) if model.key not in expanded]
+            if not waiting:
+                break
+            for rank, model in waiting:
+                expanded.add(model.key)
+                self._expand(model, rank, terms, further)
+            progress(len(self.models))
+        self._under_noise()
+        return self.best
+
+    @property
+    def best(self) -> Candidate:
+        """The model with the highest score."""
+        return max(self.models.values(), key=lambda model: model.value)
+
+    def beam(self) -> list[Candidate]:
+        """Return the leading models, best first."""
+        ranked = sorted(self.models.values(), key=lambda model: -model.value)
+        alone = self.models[()].value
+        least = ranked[0].value - 0.5 * (ranked[0].value - alone) - self.basis.number
+        return [model for rank, model in enumerate(ranked[:WIDTH]) if rank < LEAST_WIDTH or model.value >= least]
+
+    def fitted_set(self, groups: Sequence[Sequence[Term]], start: FittedModel, move: str) -> Candidate:
+        """Return the model of given effects, added one after the other, each from the best shapes of its grid.
+
+        Args:
+            groups: for each effect its candidates, one for each shape.
+            start: the simulation alone.
+            move: how the search came to it.
+        """
+        fit = start
+        for group in groups:
+            [addition] = additions(fit, with_wide_grid(group, fit.model.prepared), self.settings.noise)[:1]
+            fit = _best([_added(fit, *begin) for begin in addition.starts])
+        return Candidate(fit, score(fit, self.basis, self.settings), move)
+
+    def _expand(self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term]) -> None:
+        """Fit and score the models that one move leads to."""
+        fit, have = model.fit, len(model.fit.model.terms)
+        works: list[tuple[ModelKey, str, Callable[[], FittedModel | None]]] = []
+        if have < MOST_TERMS:
+            for addition in self._chosen(additions(fit, terms, self.settings.noise), model, rank, further):
+                key = model_key([*fit.model.terms, addition.starts[0][0]])
+                works.append((key, f"add {called(addition.starts[0][0])}", partial(_with, fit, addition)))
+        for number, term in enumerate(fit.model.terms):
+            if have > 1:
+                rest = [other for other in fit.model.terms if other is not term]
+                works.append((model_key(rest), f"drop {called(term)}", partial(_without, fit, number)))
+            for other in special_cases(term, self.terms, fit.model.prepared):
+                rest = [*fit.model.terms[:number], *fit.model.terms[number + 1 :], other]
+                move = f"exchange {called(term)} for {called(other)}"
+                works.append((model_key(rest), move, partial(_exchanged, fit, number, self._all(other))))
+        for ordered in in_other_orders(fit):
+            works.append((model_key(ordered), "another order in series", partial(_reordered, fit, ordered)))
+        self._fit(works, fit)
+
+    def _chosen(
+        self, found: Sequence[Addition], model: Candidate, rank: int, further: Sequence[Term]
+    ) -> list[Addition]:
+        """Return the additions to fit: the largest linear gains, less the price of the effect's numbers."""
+
+        def value(addition: Addition) -> float:
+            return addition.gain - self._price(addition.starts[0][0], addition.starts[0][1])
+
+        most = _ADDITIONS[min(rank, len(_ADDITIONS) - 1)]
+        ranked = sorted(found, key=value, reverse=True)
+        if model.fit.model.terms:
+            ranked = [a for a in ranked if a.gain >= _PAYS * self._price(a.starts[0][0], a.starts[0][1])]
+            return ranked[:most]
+        first = [addition for term in further for addition in found if addition.key == term.key]
+        first = list({addition.key: addition for addition in first}.values())
+        others = [addition for addition in ranked if addition.key not in {a.key for a in first}]
+        return [*first, *others[: max(most - len(first), most // 2)]]
+
+    def _price(self, term: Term, size: torch.Tensor) -> float:
+        naming = self.settings.naming
+        form = naming.is_generalisation * term.effect.is_generalisation + naming.nameless * term.effect.is_curve
+        return self.basis.number * (len(size) + len(term.effect.fitted_shape)) + self.basis.choice + form
+
+    def _all(self, term: Term) -> tuple[Term, ...]:
+        return tuple(other for other in self.terms if other.key == term.key)
+
+    def _fit(self, works: Sequence[tuple[ModelKey, str, Callable[[], FittedModel | None]]], near: FittedModel) -> None:
+        """Fit and score models that are not known yet, in parallel."""
+        new: dict[ModelKey, tuple[str, Callable[[], FittedModel | None]]] = {}
+        for key, move, work in works:
+            if key not in self.models and len(self.models) + len(new) < MOST_MODELS:
+                new.setdefault(key, (move, work))
+        tried = [partial(self._scored, move, work) for move, work in new.values()]
+        found = run_parallel(tried, near.model.prepared, self.terms, "model")
+        self._keep([model for model in found if model is not None])
+
+    def _scored(self, move: str, work: Callable[[], FittedModel | None]) -> Candidate | None:
+        fit = work()
+        return None if fit is None else Candidate(fit, score(fit, self.basis, self.settings), move)
+
+    def _keep(self, models: Iterable[Candidate]) -> None:
+        for model in models:
+            self.models[model.key] = model
+
+    def _under_noise(self) -> None:
+        """Fit the leading models under their process noise too; keep the fit that scores higher."""
+        leading = sorted(self.models.values(), key=lambda model: -model.value)[:_NOISY]
+        works = [partial(self._with_noise, model) for model in leading]
+        self._keep(run_parallel(works, leading[0].fit.model.prepared, self.terms, "model"))
+
+    def _with_noise(self, model: Candidate) -> Candidate:
+        try:
+            noisy = fit_with_process_noise(model.fit, self.declared, self.settings.noise).fit
+        except NoFitError:
+            return model
+        other = replace(model, fit=noisy, score=score(noisy, self.basis, self.settings))
+        return other if other.value > model.value else model
+
+
+def called(term: Term) -> str:
+    """Return an effect with its place and its columns, for the trail."""
+    columns = f"({','.join(term.columns)})" if term.columns else ""
+    return f"{term.effect.id}@{term.port}{columns}"
+
+
+def _best(fits: Sequence[FittedModel]) -> FittedModel:
+    return max(fits, key=lambda fit: fit.log_likelihood)
+
+
+def _with(fit: FittedModel, addition: Addition) -> FittedModel:
+    """Return the fit with one more effect, from its best shapes."""
+    begun = [_begun(fit, term, size) for term, size in addition.starts]
+    best = max(found.log_likelihood for found in begun)
+    near = [found for found in begun if found.log_likelihood >= fit.log_likelihood + 0.5 * (best - fit.log_likelihood)]
+    return with_form_of_grid(_best([shape_fitted(found) for found in near]))
+
+
+def _added(fit: FittedModel, term: Term, size: torch.Tensor) -> FittedModel:
+    return shape_fitted(_begun(fit, term, size))
+
+
+def _begun(fit: FittedModel, term: Term, size: torch.Tensor) -> FittedModel:
+    """Return the fit with one more effect at a fixed shape, from its linear size and from 0."""
+    model = fit.model.with_term(term)
+    starts = (torch.cat([fit.parameters, size]), torch.cat([fit.parameters, torch.zeros_like(size)]))
+    return _best([fitted_with_effect(fit, model, start, graduate=False) for start in starts])
+
+
+def _without(fit: FittedModel, number: int) -> FittedModel | None:
+    start = without_term(fit, number)
+    try:
+        return shape_fitted(fitted(start.model, start.parameters, fit.bound, graduate=False))
+    except NoFitError:
+        return None
+
+
+def _exchanged(fit: FittedModel, number: int, group: Sequence[Term]) -> FittedModel | None:
+    """Return the fit with another effect in place of one, from all shapes of its grid."""
+    rest = _without(fit, number) if len(fit.model.terms) > 1 else _refitted(without_term(fit, number), fit)
+    if rest is None:
+        return None
+    zero = rest.parameters.new_zeros(rest.model.with_term(group[0]).size - rest.model.size)
+    return _best([_added(rest, term, zero) for term in group])
+
+
+def _refitted(start: FittedModel, like: FittedModel) -> FittedModel | None:
+    try:
+        return fitted(start.model, start.parameters, like.bound, graduate=False)
+    except NoFitError:
+        return None
+
+
+def _reordered(fit: FittedModel, terms: tuple[Term, ...]) -> FittedModel | None:
+    model = JointModel(fit.model.prepared, terms, fit.model.near)
+    try:
+        return shape_fitted(fitted(model, fit.parameters, fit.bound, graduate=False))
+    except NoFitError:
+        return None

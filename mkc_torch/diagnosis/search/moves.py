@@ -1,0 +1,197 @@
+"""Moves of the search from one set of effects to the next, proposed by the linearised model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.shapes import absolute, reach_of, within_a_sample
+from mkc_torch.diagnosis.model.term import Key, Term
+from mkc_torch.diagnosis.search.tangents import tangents_of
+from mkc_torch.diagnosis.settings import NoiseSettings
+from mkc_torch.simulation.protocol import PreparedSimulation
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+_LONGEST = 3.0
+"""Recording over the longest lag or delay tried."""
+
+_RATIO = 2.0
+"""Ratio of neighbouring lags and delays."""
+
+STARTS = 3
+"""Shapes from which an effect is fitted: the best local maxima of its linear gain."""
+
+
+@dataclass(frozen=True)
+class Addition:
+    """An effect to add: its shapes to start from with their linear sizes, best first, and its linear gain in nats."""
+
+    starts: tuple[tuple[Term, Float[Tensor, " q"]], ...]
+    gain: float
+
+    @property
+    def key(self) -> Key:
+        """Identity of the effect without its shape."""
+        return self.starts[0][0].key
+
+
+def linear_gains(
+    fit: FittedModel, terms: Sequence[Term], settings: NoiseSettings
+) -> tuple[list[float], list[Float[Tensor, " q"]]]:
+    """Return gains of candidates in the linearised model with white noise, and their sizes.
+
+    Args:
+        fit: the fit to linearise at.
+        terms: candidates.
+        settings: which samples count.
+
+    Returns:
+        Log-likelihood ratios in nats, 0 for a size whose sign the physics does not allow; and the sizes.
+    """
+    tangents = tangents_of(fit.model, fit.parameters, settings, terms)
+    values, counts = fit.pseudo(settings)
+    weight = counts / fit.d
+    y = (values * weight).flatten()
+    own = torch.linalg.qr((tangents.nuisance * weight.unsqueeze(-1)).flatten(0, 1))[0]
+    y = y - own @ (own.mT @ y)
+    power, samples = float(y.square().sum()), float(counts.sum())
+    gains, sizes = [], []
+    for term, columns in zip(terms, tangents.candidates, strict=True):
+        moved = (columns * weight.unsqueeze(-1)).flatten(0, 1)
+        moved = moved - own @ (own.mT @ moved)
+        scale = moved.norm(dim=0).clamp(min=1e-300)
+        size = -torch.linalg.lstsq(moved / scale, y.unsqueeze(-1), driver="gelsd").solution[:, 0] / scale
+        within = size.clamp(term.effect.lower, term.effect.upper)
+        left = float((y + moved @ within).square().sum())
+        better = math.isfinite(left) and left < power
+        gains.append(0.5 * samples * math.log(power / max(left, 1e-300)) if better else 0.0)
+        sizes.append(within)
+    return gains, sizes
+
+
+def additions(fit: FittedModel, terms: Sequence[Term], settings: NoiseSettings) -> list[Addition]:
+    """Return the effects that a model can add, by descending linear gain, each with its best shapes.
+
+    Args:
+        fit: the model.
+        terms: candidates with the shapes of their grids; effects that the model has are left out.
+        settings: which samples count.
+    """
+    known = {term.key for term in fit.model.terms}
+    terms = [term for term in terms if term.key not in known]
+    if not terms:
+        return []
+    gains, sizes = linear_gains(fit, terms, settings)
+    groups: dict[Key, list[int]] = {}
+    for number, term in enumerate(terms):
+        groups.setdefault(term.key, []).append(number)
+    found = []
+    for numbers in groups.values():
+        best = local_maxima([terms[n] for n in numbers], [gains[n] for n in numbers])
+        starts = tuple((terms[numbers[k]], sizes[numbers[k]]) for k in best)
+        found.append(Addition(starts, max(gains[n] for n in numbers)))
+    return sorted(found, key=lambda addition: -addition.gain)
+
+
+def local_maxima(terms: Sequence[Term], gains: Sequence[float]) -> list[int]:
+    """Return the places of the best local maxima of a gain over shapes, best first, at most :data:`STARTS`.
+
+    Two shapes are neighbours if one number differs by a step of the grid.
+    """
+    names = sorted({name for term in terms for name in term.shape})
+    grids = {name: sorted({float(term.shape[name]) for term in terms if name in term.shape}) for name in names}
+    places = [tuple(grids[name].index(float(term.shape[name])) for name in names) for term in terms]
+    chosen: list[int] = []
+    for number in sorted(range(len(terms)), key=lambda n: -gains[n]):
+        near = [n for n in chosen if sum(abs(a - b) for a, b in zip(places[n], places[number], strict=True)) <= 1]
+        if not near and len(chosen) < STARTS:
+            chosen.append(number)
+    return chosen
+
+
+def with_wide_grid(terms: Sequence[Term], prepared: PreparedSimulation) -> tuple[Term, ...]:
+    """Return candidates with lags and delays from a sample to a third of the longest run, in ratios of two.
+
+    Other shapes keep the grid of their effect.
+    """
+    found: list[Term] = []
+    done: set[Key] = set()
+    for term in terms:
+        names = [name for name in term.effect.fitted_shape if name in term.effect.continuous and name in term.shape]
+        if len(names) != 1 or len(term.shape) != 1:
+            found.append(term)
+        elif term.key not in done:
+            done.add(term.key)
+            found += [replace(term, shape={names[0]: value}) for value in _wide(term, names[0], prepared)]
+    return tuple(term for term in found if not within_a_sample(term, prepared))
+
+
+def _wide(term: Term, name: str, prepared: PreparedSimulation) -> Iterator[float]:
+    """Yield the values of a lag or delay within its limits."""
+    low, high = reach_of(term, prepared)[name]
+    step = prepared.time.diff()
+    value = max(float(step[step > 0].median()), low)
+    most = min(_longest_run(prepared) / _LONGEST, high)
+    while value <= most:
+        yield value
+        value *= _RATIO
+
+
+def _longest_run(prepared: PreparedSimulation) -> float:
+    system = prepared.dynamics
+    time = prepared.time
+    if system is None:
+        return float(time[-1] - time[0])
+    first = system.begins.nonzero().squeeze(-1)
+    last = torch.cat([first[1:] - 1, first.new_tensor([len(time) - 1])])
+    return float((time[last] - time[first]).max())
+
+
+def special_cases(term: Term, terms: Sequence[Term], prepared: PreparedSimulation) -> list[Term]:
+    """Return the candidates that are a special case of an effect, or that it is one of, at the same channels."""
+    channels = prepared.ports[term.port].channels
+    found = []
+    for other in terms:
+        pair = (term.effect, other.effect), (other.effect, term.effect)
+        nested = any(
+            general.reduces_to is not None and general.reduces_to.id == special.id for general, special in pair
+        )
+        if nested and prepared.ports[other.port].channels == channels and other.columns == term.columns:
+            found.append(other)
+    return found
+
+
+def in_other_orders(fit: FittedModel) -> list[tuple[Term, ...]]:
+    """Return the effects with one static effect before or behind those with memory, where both are in series.
+
+    A driver's dead zone comes before the lag of its motor, the square law of a propeller behind it.
+    """
+    terms, ports = fit.model.terms, fit.model.prepared.ports
+    # a pure delay commutes with every static effect
+    lagging = {term.port for term in terms if term.effect.remembers and "delay" not in term.shape}
+    found = []
+    for number, term in enumerate(terms):
+        if not term.effect.remembers and term.port in lagging and ports[term.port].in_series(term.port):
+            found.append((*terms[:number], replace(term, first=not term.first), *terms[number + 1 :]))
+    return found
+
+
+__all__ = [
+    "STARTS",
+    "Addition",
+    "absolute",
+    "additions",
+    "in_other_orders",
+    "linear_gains",
+    "local_maxima",
+    "special_cases",
+    "with_wide_grid",
+]
