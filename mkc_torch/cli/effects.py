@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 def effects(
     recording: Annotated[
         Path | None,
-        typer.Argument(metavar="[REC]", show_default=False, help="A recording of the simulated system."),
+        typer.Argument(metavar="REC", show_default=False, help="A recording of the simulated system."),
     ] = None,
     simulation: Annotated[
         str | None, typer.Option(metavar="NAME", help=f"Simulation: {', '.join(SIMULATIONS)}, {OWN_SIMULATION}")
