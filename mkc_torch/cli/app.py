@@ -14,6 +14,7 @@ from mkc_torch.cli.calibrate import calibrate
 from mkc_torch.cli.demo import demo
 from mkc_torch.cli.diagnose import diagnose
 from mkc_torch.cli.doctor import doctor
+from mkc_torch.cli.effects import effects
 from mkc_torch.cli.export import export
 from mkc_torch.cli.inspect import inspect
 from mkc_torch.cli.new import new_effect, new_simulation
@@ -67,6 +68,7 @@ app.command(short_help="Calibrate a magnetometer or an accelerometer.")(calibrat
 app.command(short_help="Correct a recording with a calibration or a model.")(apply)
 app.command(short_help="Write a calibration for an autopilot, ROS or C.")(export)
 app.command(short_help="Show what a file holds, and which commands take it.")(inspect)
+app.command(short_help="List the effects, and where each can act in a simulation.")(effects)
 app.command(short_help="Try all of it on simulated sensors; needs no file.")(demo)
 app.command(short_help="Show what is installed, and what is missing.")(doctor)
 app.command(short_help="Write a template for your own simulation.")(new_simulation)

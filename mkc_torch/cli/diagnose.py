@@ -21,7 +21,6 @@ from mkc_torch.cli.console import (
     interrupts_reported,
     not_written,
     out,
-    parsed_columns,
     parsed_pairs,
     progress,
     refuse_same_names,
@@ -29,21 +28,28 @@ from mkc_torch.cli.console import (
 from mkc_torch.cli.diagnosis_request import (
     INPUT_HOLDS,
     LEVEL,
-    MAGNETOMETER,
     SIMULATIONS,
     SURROGATES,
     TOGETHER,
     Outcome,
     Request,
-    is_file_of_a_simulation,
 )
 from mkc_torch.cli.loading import loading
+from mkc_torch.cli.simulation_option import (
+    COLUMNS_HELP,
+    COLUMNS_METAVAR,
+    OWN_SIMULATION,
+    RUN_COLUMN_HELP,
+    checked_columns,
+    checked_sensor,
+    checked_simulation,
+    checked_units,
+)
 from mkc_torch.cli.units_option import (
     CONVERT_HELP,
     CONVERT_METAVAR,
     LABEL_HELP,
     SENSOR_HELP,
-    parsed_units,
     reading_options,
     split_trailing_pairs,
 )
@@ -61,7 +67,7 @@ def diagnose(
         typer.Option(
             metavar="NAME",
             help=f"Simulation to compare with: {', '.join(SIMULATIONS)} (default for a magnetometer's recording), "
-            "FILE.py:CLASS, FILE.py with a single class, or MODEL.fmu. The code in the file is run.",
+            f"{OWN_SIMULATION}",
         ),
     ] = None,
     simulator_output: Annotated[
@@ -72,14 +78,14 @@ def diagnose(
     ] = None,
     columns: Annotated[
         str | None,
-        typer.Option(metavar="NAME=COLUMN,...", help="Names of the columns in the file: mag_x=mx,temperature=IMU_T"),
+        typer.Option(metavar=COLUMNS_METAVAR, help=COLUMNS_HELP),
     ] = None,
     convert: Annotated[list[str] | None, typer.Option(metavar=CONVERT_METAVAR, help=CONVERT_HELP)] = None,
     unit_label: Annotated[str | None, typer.Option(metavar="UNIT", help=LABEL_HELP)] = None,
     sensor: Annotated[str | None, typer.Option(metavar="NAME", help=SENSOR_HELP)] = None,
     run_column: Annotated[
         str | None,
-        typer.Option(metavar="COLUMN", help="Column that separates the runs of a table; default: experiment, if any."),
+        typer.Option(metavar="COLUMN", help=RUN_COLUMN_HELP),
     ] = None,
     together: Annotated[
         bool,
@@ -122,11 +128,11 @@ def diagnose(
     """
     recordings, conversions = split_trailing_pairs(recordings, convert or [])
     request = Request(
-        simulation=_known(simulation, simulator_output),
+        simulation=checked_simulation(simulation, simulator_output),
         simulator_output=simulator_output,
-        columns=_columns(columns, run_column),
-        units=_units(conversions, unit_label, simulation),
-        sensor=_sensor(sensor, simulation),
+        columns=checked_columns(columns, run_column),
+        units=checked_units(conversions, unit_label, simulation),
+        sensor=checked_sensor(sensor, simulation),
         noise=_noise(noise or []),
         input_hold=_input_hold(input_hold or []),
         level=_level(level),
@@ -135,7 +141,7 @@ def diagnose(
         quick=quick,
         time_limit=_time_limit(time_limit),
         force=force,
-        read_with=reading_options(_columns(columns, run_column), conversions, unit_label, sensor),
+        read_with=reading_options(checked_columns(columns, run_column), conversions, unit_label, sensor),
     )
     refuse_same_names(recordings)
     with loading():
@@ -213,19 +219,6 @@ def _print_outcomes(outcomes: list[Outcome], step: Steps) -> None:
                 typer.echo(outcome.text, nl=False)
 
 
-def _known(simulation: str | None, simulator_output: Path | None) -> str:
-    if simulation is not None and simulator_output is not None:
-        raise typer.BadParameter(
-            "give one of --simulation and --simulator-output: a simulation, or the table that a simulator wrote."
-        )
-    if simulation is not None and simulation not in SIMULATIONS and not is_file_of_a_simulation(simulation):
-        raise typer.BadParameter(
-            f'--simulation "{simulation}" is unknown; give {", ".join(SIMULATIONS)}, or your own simulation as '
-            "FILE.py:CLASS or MODEL.fmu."
-        )
-    return simulation or ""
-
-
 def _refuse_unusable(request: Request, simulation_of: Callable[[Request], object]) -> None:
     """Exit with one message, before anything is written, if the simulation cannot be loaded."""
     if request.undecided:
@@ -235,33 +228,6 @@ def _refuse_unusable(request: Request, simulation_of: Callable[[Request], object
     except FAILURES as error:
         complain(request.simulator_output or request.simulation, error)
         raise typer.Exit(1) from None
-
-
-def _columns(columns: str | None, run_column: str | None) -> dict[str, str]:
-    names = parsed_columns(columns)
-    if run_column is None:
-        return names
-    if not run_column.strip():
-        raise typer.BadParameter("--run-column is empty; name the column that separates the runs.")
-    if names.setdefault("experiment", run_column.strip()) != run_column.strip():
-        raise typer.BadParameter("--columns and --run-column name different columns for experiment; leave one out.")
-    return names
-
-
-def _units(conversions: list[str], label: str | None, simulation: str | None) -> dict[str, str]:
-    units = parsed_units(conversions, label)
-    if "mag" in units and simulation not in (None, MAGNETOMETER):
-        raise typer.BadParameter(
-            "--unit-label and --convert mag=... apply to a magnetometer. Your own simulation declares its units in "
-            "`units`; its time and its columns can be converted by name: --convert time=us."
-        )
-    return units
-
-
-def _sensor(sensor: str | None, simulation: str | None) -> str | None:
-    if sensor is not None and simulation not in (None, MAGNETOMETER):
-        raise typer.BadParameter("--sensor names a magnetometer; your own simulation takes columns by name.")
-    return sensor
 
 
 def _noise(texts: list[str]) -> dict[str, float]:

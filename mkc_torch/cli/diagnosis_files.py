@@ -48,8 +48,8 @@ def diagnose_file(
     jointly. A failed run does not stop the others. ``step`` is called with each stage.
     """
     try:
-        request, note = _decided(path, request)
-        recording = _read(path, request)
+        request, note = decided(path, request)
+        recording = read_recording(path, request)
         simulation = simulation_of(request)
         claim_folder(folder, overwrite=request.force, files=WRITTEN)
     except Exception as error:
@@ -77,8 +77,8 @@ def diagnose_together(
     recordings, notes = [], []
     for path in paths:
         try:
-            own, note = _decided(path, request)
-            recordings.append(_read(path, own))
+            own, note = decided(path, request)
+            recordings.append(read_recording(path, own))
         except Exception as error:
             return [_failed(path, "", error)]
         notes.append(note)
@@ -96,8 +96,12 @@ def diagnose_together(
     return [replace(outcome, note=next((note for note in notes if note), ""))]
 
 
-def _decided(path: Path, request: Request) -> tuple[Request, str]:
-    """Return the request with a simulation, chosen by the recording's columns if none is given, and a note on it."""
+def decided(path: Path, request: Request) -> tuple[Request, str]:
+    """Return the request with a simulation, chosen by the recording's columns if none is given, and a note on it.
+
+    Raises:
+        RecordingError: no simulation is given, and the recording has no magnetometer.
+    """
     if not request.undecided:
         return request, ""
     try:
@@ -111,7 +115,12 @@ def _decided(path: Path, request: Request) -> tuple[Request, str]:
     return replace(request, simulation=MAGNETOMETER), note
 
 
-def _read(path: Path, request: Request) -> Recording:
+def read_recording(path: Path, request: Request) -> Recording:
+    """Read a recording for the simulation of a request.
+
+    Raises:
+        RecordingError, OSError: the file cannot be used.
+    """
     if request.simulator_output is None and request.simulation == MAGNETOMETER:
         return read_magnetometer(path, request.columns, request.units, request.sensor)[0]
     return read_table(path, request.columns, request.units)

@@ -238,7 +238,7 @@ class PreparedStatic(ClosedForm):
             for added in (constants, outputs)
         )
         self.state: Mapping[str, object] = {"class": system.name, "fixed": fixed, "unscaled": unscaled}
-        self.ports = _ports(system, units, self.unit, self.inputs, self.measured, fixed, unscaled)
+        self.ports = static_ports(system, units, self.unit, self.inputs, self.measured, fixed, unscaled)
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:
         return self.time.new_tensor([parameter.value for parameter in self.known.values()])
@@ -310,7 +310,7 @@ class StaticCorrection:
         self.inputs = _inputs(system, recording)
         units = {name: system.units.get(name, "") for name in (*system.inputs, *system.outputs)}
         nothing = self.time.new_zeros(len(self.time), len(system.outputs))
-        self.ports = _ports(system, units, "", self.inputs, nothing, fixed, unscaled)
+        self.ports = static_ports(system, units, "", self.inputs, nothing, fixed, unscaled)
 
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
         """The simulated outputs with the effects."""
@@ -333,7 +333,7 @@ def _changed_inputs(system: Static, inputs: Float[Tensor, "N k"], changes: Chang
     return torch.cat(columns, -1) if columns else inputs
 
 
-def _ports(
+def static_ports(
     system: Static,
     units: Mapping[str, str],
     unit: str,
@@ -342,6 +342,17 @@ def _ports(
     fixed: Sequence[str],
     unscaled: Sequence[str],
 ) -> dict[str, Port]:
+    """Return the ports at the inputs and outputs of a function.
+
+    Args:
+        system: the function.
+        units: unit of each input and output.
+        unit: common unit of the outputs; empty where the units differ.
+        inputs: (N, k), the recorded inputs, for the sizes of the signals.
+        measured: (N, m), the recorded outputs, likewise.
+        fixed: outputs that no parameter shifts.
+        unscaled: outputs that no parameter scales.
+    """
     ports = {}
     for k, name in enumerate(system.inputs):
         ports[f"input {name}"] = Port(

@@ -12,12 +12,13 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.term import Driver, Term, run_parallel
+from mkc_torch.diagnosis.model.term import Driver, Drivers, Term, find_drivers, run_parallel
+from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Shape
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.ports import Change, Nearby, Port, SignalSizes
-from mkc_torch.simulation.protocol import PreparedSimulation
+from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -42,6 +43,22 @@ _SETTLED_NATS = 0.5
 """Gain of a round up to which there is no further round."""
 
 
+def candidates_of(
+    simulation: Simulation, prepared: PreparedSimulation, effects: Sequence[Effect], settings: DriverSettings
+) -> tuple[Drivers, tuple[Term, ...]]:
+    """Return the drivers in a simulation's recording, and all candidates.
+
+    Args:
+        simulation: the simulation, whose own columns drive nothing.
+        prepared: the simulation with the recording, in open loop.
+        effects: the catalogue.
+        settings: which columns are drivers.
+    """
+    roles = frozenset(role for effect in effects for role in effect.roles)
+    found = find_drivers(prepared.recording, simulation.columns, settings, roles, simulation.measured)
+    return found, candidate_terms(prepared, found.drivers, effects)
+
+
 def candidate_terms(
     prepared: PreparedSimulation, drivers: Sequence[Driver], effects: Sequence[Effect]
 ) -> tuple[Term, ...]:
@@ -49,7 +66,7 @@ def candidate_terms(
     terms = []
     own = {driver.columns for driver in drivers if not _repeats_an_input(driver, prepared)}
     for effect in effects:
-        places = [name for name, port in prepared.ports.items() if _fits(effect, name, port)]
+        places = ports_of(effect, prepared.ports)
         # an effect without roles, or with an optional driver, is also tried without a driver
         alone = not effect.roles or effect.driver_optional
         fitting = [*([None] if alone else []), *(d for d in drivers if _drives(d, effect))]
@@ -83,10 +100,24 @@ def within_a_sample(term: Term, prepared: PreparedSimulation) -> bool:
     return term.effect.within_a_sample(term.shape, step)
 
 
-def _fits(effect: Effect, name: str, port: Port) -> bool:
-    """Whether an effect acts at a port."""
-    known = set(port.parts)
-    return effect.port in (name, port.kind) and set(effect.needs) <= known and known.isdisjoint(effect.excludes)
+def ports_of(effect: Effect, ports: Mapping[str, Port]) -> tuple[str, ...]:
+    """Return the names of the ports at which an effect acts.
+
+    Example:
+        >>> from mkc_torch.effects.dynamics.input_lag import InputLag
+        >>> ports_of(
+        ...     InputLag(),
+        ...     {"output": Port(("x",), "m"), "input u": Port(("u",), "V", kind="input", parts={"own": "u"})},
+        ... )
+        ('input u',)
+    """
+    return tuple(
+        name
+        for name, port in ports.items()
+        if effect.port in (name, port.kind)
+        and set(effect.needs) <= set(port.parts)
+        and set(port.parts).isdisjoint(effect.excludes)
+    )
 
 
 def absolute(effect: Effect, shape: Shape, port: Port, driver: Driver | None = None) -> Shape:

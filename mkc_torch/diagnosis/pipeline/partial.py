@@ -15,8 +15,8 @@ from mkc_torch.diagnosis.evidence.run import EvidenceReport, all_results, in_sho
 from mkc_torch.diagnosis.findings.noise import offsets_of, runs_of, shared_offsets
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, first_samples
-from mkc_torch.diagnosis.model.shapes import candidate_terms, within_a_sample
-from mkc_torch.diagnosis.model.term import Drivers, Term, common_parts, find_drivers
+from mkc_torch.diagnosis.model.shapes import candidates_of, within_a_sample
+from mkc_torch.diagnosis.model.term import Drivers, Term, common_parts
 from mkc_torch.diagnosis.pipeline.build import DiagnosisInputs, build_diagnosis
 from mkc_torch.diagnosis.pipeline.prepare import Problem
 from mkc_torch.diagnosis.pipeline.search_notes import with_search_notes
@@ -81,11 +81,7 @@ class PartialResult:
         """The recorded columns that can drive an effect, and the candidates."""
         if self._candidates is None:
             prepared, settings = self.base.model.prepared.open_loop(), self.options.settings
-            roles = frozenset(role for effect in self.effects for role in effect.roles)
-            found = find_drivers(
-                prepared.recording, self.simulation.columns, settings.drivers, roles, self.simulation.measured
-            )
-            self._candidates = found, candidate_terms(prepared, found.drivers, self.effects)
+            self._candidates = candidates_of(self.simulation, prepared, self.effects, settings.drivers)
         return self._candidates
 
     def open_loop_findings(self, search: StepwiseSearch) -> OpenLoop:
