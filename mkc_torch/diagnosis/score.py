@@ -16,16 +16,19 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from mkc_torch._support.quantum import rounding_of
 from mkc_torch.diagnosis.goodness_of_fit import size_of
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
 from mkc_torch.simulation.dynamics.horizons import horizons_of, log_likelihood_ahead, per_sample
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid, key_of
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel
+from mkc_torch.simulation.dynamics.ports import RATES
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -38,6 +41,12 @@ _ROUNDS = 3
 
 _SETTLED = 0.05
 """Nats that a step has to gain for another."""
+
+FAR = 10.0
+"""Multiple of the recording's largest rate above which an effect is implausible."""
+
+_USUAL = 0.9
+"""Quantile of an effect's changes over time that is compared."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +62,7 @@ class ScoreBasis:
         choice: nats for the choice of an effect, the logarithm of the number of candidates.
         rounding: smallest white noise of each output.
         declared: known standard deviations of the outputs' white noise, by output.
+        largest: (p+m,), largest plausible change of each rate and drift of each output.
     """
 
     horizons: tuple[int, ...]
@@ -63,6 +73,7 @@ class ScoreBasis:
     choice: float
     rounding: tuple[float, ...]
     declared: Mapping[str, float]
+    largest: Float[np.ndarray, " p+m"]
 
     @property
     def number(self) -> float:
@@ -125,8 +136,10 @@ def basis_of(base: FittedModel, candidates: int, declared: Mapping[str, float], 
     counts = prepared.counts.double().cpu().numpy()
     choice = math.log(max(candidates, 1))
     if flow is None:
-        return ScoreBasis((1,), span, counts, len(counts), 1.0, choice, rounding, declared)
-    basis = ScoreBasis(horizons_of(flow), span, counts, len(counts), 1.0, choice, rounding, declared)
+        raise NoFitError("The simulation has no finite trajectory at the fitted values.")
+    theta, changes = base.parameters[: base.model.base], base.model.changes(base.parameters)
+    largest = plausible_sizes(prepared, theta, changes, base.model.near)
+    basis = ScoreBasis(horizons_of(flow), span, counts, len(counts), 1.0, choice, rounding, declared, largest)
     alone = score(base, basis, settings)
     return basis if alone is None else replace(basis, kappa=variance_ratio(alone.per_sample, basis.horizons[-1]))
 
@@ -168,11 +181,11 @@ def score(
         near: further noise models to try.
     """
     flow = _flow(fit)
-    if flow is None:
+    if flow is None or _is_implausible(fit, basis):
         return None
     flow = replace(flow, counts=basis.counts)
     models = [*_grid(fit, flow, basis).singles(), *near, *_own_noise(fit, basis)]
-    best = _best_noise(flow, models, basis, settings, _largest(fit), _grid(fit, flow, basis))
+    best = _best_noise(flow, models, basis, settings, _grid(fit, flow, basis))
     if best is None:
         return None
     noise, by_horizon = best
@@ -209,11 +222,22 @@ def _flow(fit: FittedModel) -> Flow | None:
     return flow if flow is not None and all(bool(np.isfinite(array).all()) for array in arrays) else None
 
 
-def _largest(fit: FittedModel) -> Float[np.ndarray, " p+m"]:
-    """Return the largest plausible disturbance of each rate and each output."""
-    prepared, model = fit.model.prepared.dynamics, fit.model
+def _is_implausible(fit: FittedModel, basis: ScoreBasis) -> bool:
+    """Whether an effect changes a rate by far more than the rates of the recording: two that cancel each other."""
+    if not fit.model.terms:
+        return False
+    model, prepared = fit.model, fit.model.prepared.dynamics
     assert prepared is not None
-    return plausible_sizes(prepared, fit.parameters[: model.base], model.changes(fit.parameters), model.near)
+    largest = dict(zip(prepared.disturbable, basis.largest, strict=False))
+    signals = model.signals(fit.parameters)
+    for term, gamma in zip(model.terms, model.gammas(fit.parameters), strict=True):
+        port = prepared.ports[term.port]
+        if port.kind in RATES and port.channels[0] in largest:
+            signal = signals[term.port]
+            change = term.effect.change(gamma, term.shape, term.context(prepared, signal))[:, 0].detach()
+            if not float(change.abs().nan_to_num(torch.inf).quantile(_USUAL)) <= FAR * largest[port.channels[0]]:
+                return True
+    return False
 
 
 def _grid(fit: FittedModel, flow: Flow, basis: ScoreBasis) -> NoiseGrid:
@@ -248,8 +272,7 @@ def _best_noise(
     models: Sequence[NoiseModel],
     basis: ScoreBasis,
     settings: Settings,
-    largest: Float[np.ndarray, " p+m"] | None,
-    grid: NoiseGrid | None = None,
+    grid: NoiseGrid,
 ) -> tuple[NoiseModel, tuple[float, ...]] | None:
     """Return the noise that scores best, refined on the grid, at its scale, and its log-likelihood by horizon."""
 
@@ -262,7 +285,7 @@ def _best_noise(
                 sensor=tuple(scale * size for size in noise.sensor),
                 components=tuple((place, scale * size, lasting) for place, size, lasting in noise.components),
             )
-            if largest is not None and any(size > largest[place] for place, size, _ in scaled.components):
+            if any(size > basis.largest[place] for place, size, _ in scaled.components):
                 continue
             price = settings.noise.disturbance_gain * len(noise.components) + basis.number * _noise_numbers(noise)
             value = float(each.mean()) - price
@@ -274,9 +297,8 @@ def _best_noise(
     if not math.isfinite(found[0]):
         return None
     seen = {key_of(model) for model in models}
-    for decades in _DECADES if grid is not None else ():
+    for decades in _DECADES:
         for _ in range(_ROUNDS):
-            assert grid is not None
             others = [model for model in grid.neighbours(found[1], decades) if key_of(model) not in seen]
             if not others:
                 break

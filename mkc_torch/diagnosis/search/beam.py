@@ -151,7 +151,7 @@ class BeamSearch:
         """Fit and score the models that one move leads to."""
         fit, have = model.fit, len(model.fit.model.terms)
         works: list[tuple[ModelKey, str, Callable[[], FittedModel | None]]] = []
-        if have < MOST_TERMS:
+        if have < MOST_TERMS and not any(term.effect.is_curve for term in fit.model.terms):
             for addition in self._chosen(additions(fit, terms, self.settings.noise), model, rank, further):
                 key = model_key([*fit.model.terms, addition.starts[0][0]])
                 works.append((key, f"add {called(addition.starts[0][0])}", partial(_with, fit, addition)))
@@ -240,7 +240,8 @@ def _with(fit: FittedModel, addition: Addition) -> FittedModel:
     """Return the fit with one more effect, from its best shapes."""
     begun = [_begun(fit, term, size) for term, size in addition.starts]
     best = max(found.log_likelihood for found in begun)
-    near = [found for found in begun if found.log_likelihood >= fit.log_likelihood + 0.5 * (best - fit.log_likelihood)]
+    least = min(0.5 * (best + fit.log_likelihood), best)
+    near = [found for found in begun if found.log_likelihood >= least]
     return with_form_of_grid(_best([shape_fitted(found) for found in near]))
 
 
@@ -249,10 +250,13 @@ def _added(fit: FittedModel, term: Term, size: torch.Tensor) -> FittedModel:
 
 
 def _begun(fit: FittedModel, term: Term, size: torch.Tensor) -> FittedModel:
-    """Return the fit with one more effect at a fixed shape, from its linear size and from 0."""
+    """Return the fit with one more effect at a fixed shape, from its linear size, or from 0 if that gains nothing."""
     model = fit.model.with_term(term)
-    starts = (torch.cat([fit.parameters, size]), torch.cat([fit.parameters, torch.zeros_like(size)]))
-    return _best([fitted_with_effect(fit, model, start, graduate=False) for start in starts])
+    found = fitted_with_effect(fit, model, torch.cat([fit.parameters, size]), graduate=False)
+    if found.log_likelihood > fit.log_likelihood:
+        return found
+    zero = torch.cat([fit.parameters, torch.zeros_like(size)])
+    return _best([found, fitted_with_effect(fit, model, zero, graduate=False)])
 
 
 def _without(fit: FittedModel, number: int) -> FittedModel | None:

@@ -108,7 +108,10 @@ def local_maxima(terms: Sequence[Term], gains: Sequence[float]) -> list[int]:
     """
     names = sorted({name for term in terms for name in term.shape})
     grids = {name: sorted({float(term.shape[name]) for term in terms if name in term.shape}) for name in names}
-    places = [tuple(grids[name].index(float(term.shape[name])) for name in names) for term in terms]
+    places = [
+        tuple(grids[name].index(float(term.shape[name])) if name in term.shape else -1 for name in names)
+        for term in terms
+    ]
     chosen: list[int] = []
     for number in sorted(range(len(terms)), key=lambda n: -gains[n]):
         near = [n for n in chosen if sum(abs(a - b) for a, b in zip(places[n], places[number], strict=True)) <= 1]
