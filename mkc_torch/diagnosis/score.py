@@ -167,9 +167,7 @@ def variance_ratio(values: Float[np.ndarray, " N"], reach: int) -> float:
     return max(1.0 + 2.0 * total / power, 1.0)
 
 
-def score(
-    fit: FittedModel, basis: ScoreBasis, settings: Settings, near: Sequence[NoiseModel] = ()
-) -> Score | None:
+def score(fit: FittedModel, basis: ScoreBasis, settings: Settings, near: Sequence[NoiseModel] = ()) -> Score | None:
     """Return the score of a fitted model under the noise that scores best; None if it loses the recording.
 
     The parameters and sizes are those of the fit; noise is fitted here, on the same grid for all models.
@@ -262,9 +260,7 @@ def _own_noise(fit: FittedModel, basis: ScoreBasis) -> list[NoiseModel]:
     observer, channels = prepared.observer, prepared.channels
     known = tuple(name in basis.declared for name in channels)
     rates = prepared.disturbable
-    return [
-        NoiseModel.of(observer.disturbances, observer.sensor.tolist(), rates, channels, known, basis.rounding)
-    ]
+    return [NoiseModel.of(observer.disturbances, observer.sensor.tolist(), rates, channels, known, basis.rounding)]
 
 
 def _best_noise(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 
 import torch
 
@@ -38,6 +39,10 @@ MOST_MODELS = 60
 
 _ADDITIONS = (12, 6, 4, 3, 3, 3)
 """Number of effects that are tried in addition to the best model of the beam, the second, and so on."""
+
+LARGER = 1.05
+"""Ratio of open-loop residuals with and without an effect above which it enlarges the residual: the ratio at which
+held-out blocks reject a finding."""
 
 _PAYS = 0.5
 """Share of its price that an addition to a model with effects has to gain in the linearised model."""
@@ -73,6 +78,14 @@ class Candidate:
         """Identity of the model."""
         return model_key(self.fit.model.terms)
 
+    @cached_property
+    def log_size(self) -> float:
+        """Mean over the outputs of the log RMS of the open-loop residual; infinite if it loses the recording."""
+        free = self.fit.open_loop
+        if free is None:
+            return math.inf
+        return float(free.residual.square().mean(0).clamp(min=1e-300).sqrt().log().mean())
+
 
 def model_key(terms: Iterable[Term]) -> ModelKey:
     """Return the identity of a model with these effects."""
@@ -89,6 +102,8 @@ class BeamSearch:
         settings: thresholds.
         declared: known standard deviations of the outputs' white noise.
         models: the scored models by identity, in the order in which they were tried.
+        most_terms: largest number of effects of a model.
+        most_models: largest number of models that the search tries.
     """
 
     terms: tuple[Term, ...]
@@ -96,6 +111,8 @@ class BeamSearch:
     settings: Settings
     declared: Mapping[str, float]
     models: dict[ModelKey, Candidate] = field(default_factory=dict)
+    most_terms: int = MOST_TERMS
+    most_models: int = MOST_MODELS
 
     def run(
         self, start: FittedModel, further: Sequence[Term] = (), progress: Callable[[int], object] = lambda _: None
@@ -110,7 +127,7 @@ class BeamSearch:
         self._keep([Candidate(start, score(start, self.basis, self.settings), "")])
         terms = with_wide_grid(self.terms, start.model.prepared)
         expanded: set[ModelKey] = set()
-        while len(self.models) < MOST_MODELS:
+        while len(self.models) < self.most_models:
             waiting = [(rank, model) for rank, model in enumerate(self.beam()) if model.key not in expanded]
             if not waiting:
                 break
@@ -123,8 +140,22 @@ class BeamSearch:
 
     @property
     def best(self) -> Candidate:
-        """The model with the highest score."""
-        return max(self.models.values(), key=lambda model: model.value)
+        """The model with the highest score whose open-loop residual is not larger than with a part of its effects."""
+        return max((m for m in self.models.values() if not self.enlarges(m)), key=lambda model: model.value)
+
+    def enlarges(self, model: Candidate) -> bool:
+        """Whether a model's open-loop residual is clearly larger than that of a known model with a part of its effects.
+
+        The root mean square counts every sample: a robust fit can score higher because it takes a stretch that the
+        simulation no longer follows for outliers.
+        """
+        own = {term.key for term in model.fit.model.terms}
+        parts = [
+            other.log_size
+            for other in self.models.values()
+            if other is not model and {term.key for term in other.fit.model.terms} < own
+        ]
+        return model.log_size > min(parts, default=math.inf) + math.log(LARGER)
 
     def beam(self) -> list[Candidate]:
         """Return the leading models, best first."""
@@ -151,7 +182,7 @@ class BeamSearch:
         """Fit and score the models that one move leads to."""
         fit, have = model.fit, len(model.fit.model.terms)
         works: list[tuple[ModelKey, str, Callable[[], FittedModel | None]]] = []
-        if have < MOST_TERMS and not any(term.effect.is_curve for term in fit.model.terms):
+        if have < self.most_terms and not any(term.effect.is_curve for term in fit.model.terms):
             for addition in self._chosen(additions(fit, terms, self.settings.noise), model, rank, further):
                 key = model_key([*fit.model.terms, addition.starts[0][0]])
                 works.append((key, f"add {called(addition.starts[0][0])}", partial(_with, fit, addition)))
@@ -163,9 +194,20 @@ class BeamSearch:
                 rest = [*fit.model.terms[:number], *fit.model.terms[number + 1 :], other]
                 move = f"exchange {called(term)} for {called(other)}"
                 works.append((model_key(rest), move, partial(_exchanged, fit, number, self._all(other))))
-        for ordered in in_other_orders(fit):
-            works.append((model_key(ordered), "another order in series", partial(_reordered, fit, ordered)))
-        self._fit(works, fit)
+        orders = in_other_orders(fit)
+        works += [(model_key(o), "another order in series", partial(_reordered, fit, o)) for o in orders]
+        self._fit(works, fit, self.most_models)
+
+    def with_one_less(self, model: Candidate) -> list[Candidate]:
+        """Return the models without one of a model's effects, fitted if they are not known."""
+        fit = model.fit
+        rests = [
+            (model_key([other for other in fit.model.terms if other is not term]), number, term)
+            for number, term in enumerate(fit.model.terms)
+        ]
+        works = [(key, f"drop {called(term)}", partial(_without, fit, number)) for key, number, term in rests]
+        self._fit(works, fit, len(self.models) + len(works))
+        return [self.models[key] for key, _, _ in rests if key in self.models]
 
     def _chosen(
         self, found: Sequence[Addition], model: Candidate, rank: int, further: Sequence[Term]
@@ -193,11 +235,13 @@ class BeamSearch:
     def _all(self, term: Term) -> tuple[Term, ...]:
         return tuple(other for other in self.terms if other.key == term.key)
 
-    def _fit(self, works: Sequence[tuple[ModelKey, str, Callable[[], FittedModel | None]]], near: FittedModel) -> None:
-        """Fit and score models that are not known yet, in parallel."""
+    def _fit(
+        self, works: Sequence[tuple[ModelKey, str, Callable[[], FittedModel | None]]], near: FittedModel, most: int
+    ) -> None:
+        """Fit and score models that are not known yet, in parallel, up to a number of models in all."""
         new: dict[ModelKey, tuple[str, Callable[[], FittedModel | None]]] = {}
         for key, move, work in works:
-            if key not in self.models and len(self.models) + len(new) < MOST_MODELS:
+            if key not in self.models and len(self.models) + len(new) < most:
                 new.setdefault(key, (move, work))
         tried = [partial(self._scored, move, work) for move, work in new.values()]
         found = run_parallel(tried, near.model.prepared, self.terms, "model")
@@ -224,6 +268,24 @@ class BeamSearch:
             return model
         other = replace(model, fit=noisy, score=score(noisy, self.basis, self.settings))
         return other if other.value > model.value else model
+
+
+def in_order(model: Candidate, terms: Sequence[Term]) -> Candidate:
+    """Return a model with its effects in another order of their numbers; effects in series keep the order they act in.
+
+    Args:
+        model: the model.
+        terms: effects of the same identities, in the wanted order.
+    """
+    fit = model.fit
+    own = {term.key: number for number, term in enumerate(fit.model.terms)}
+    order = [own[term.key] for term in terms]
+    if order == sorted(order):
+        return model
+    gammas = fit.model.gammas(fit.parameters)
+    ordered = JointModel(fit.model.prepared, [fit.model.terms[number] for number in order], fit.model.near)
+    parameters = torch.cat([fit.parameters[: fit.model.base], *[gammas[number] for number in order]])
+    return replace(model, fit=replace(fit, model=ordered, parameters=parameters))
 
 
 def called(term: Term) -> str:

@@ -385,7 +385,7 @@ def _surrogate_test(
 def _beyond_usual(
     own: Float[np.ndarray, " C"], drawn: Float[np.ndarray, "C S"]
 ) -> tuple[float, Float[np.ndarray, " S"], Float[np.ndarray, " C"]]:
-    """Return the largest gain beyond what each candidate usually gains: of the recording, of surrogates, and the usual."""
+    """Return the largest gain beyond what each candidate usually gains: for recording and surrogates; and the usual."""
     usual = np.quantile(drawn, _USUAL, axis=1, keepdims=True)
     return float((own - usual[:, 0]).max()), (drawn - usual).max(0), usual[:, 0]
 

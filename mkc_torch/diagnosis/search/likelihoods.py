@@ -148,7 +148,7 @@ class LogLikelihoods:
         )
 
     def near_the_best(self, within: float) -> LogLikelihoods:
-        """Keep the first model, and those within some nats of the most likely for a series, without or with a candidate.
+        """Keep the first model, and those near the most likely of a series, without or with a candidate.
 
         The first is the white noise of the sensors, under which the residual is that of the open loop.
         """

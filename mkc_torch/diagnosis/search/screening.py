@@ -1,4 +1,4 @@
-"""Screening of all candidates at a fit of differential equations: linear gains, each with its own noise, and p-value."""
+"""Screening of all candidates at a fit of differential equations: gains with each one's own noise, and p-value."""
 
 from __future__ import annotations
 

@@ -133,9 +133,7 @@ def _ahead(flow: Flow, models: FilterModels, horizons: Sequence[int]) -> Innovat
         z, log = _standardised(new, S, models.sensor.T)
         standard.append(z)
         log_spread.append(log)
-    return Innovations(
-        np.stack(standard).transpose(3, 0, 2, 1), np.stack(log_spread).transpose(3, 0, 2, 1), *empty
-    )
+    return Innovations(np.stack(standard).transpose(3, 0, 2, 1), np.stack(log_spread).transpose(3, 0, 2, 1), *empty)
 
 
 def _composed(
