@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import torch
 
@@ -41,39 +43,59 @@ def stepwise_search(problem: Problem, known: PartialResult, baseline: ProcessNoi
         known.options = options = replace(options, max_findings=min(options.max_findings, 1))
     progress(f"trying {len(terms)} effects")
     terms = () if impossible_rotations(baseline) else terms
-    search = first_step(baseline.fit, terms, options, generator, baseline.free, known.keep_search)
-    better = _under_better_noise(baseline, search, known)
-    if better is not None:
-        progress(f"trying {len(terms)} effects under a more likely noise model")
-        known.keep_baseline(better, with_noise=True)
-        search = first_step(better.fit, terms, options, generator, better.free, known.keep_search)
-    finer = with_smaller_step(search.found[-1].fit, options.settings.noise) if search.found else None
-    if finer is not None:
-        return stepwise_search(problem, known, fit_baseline(problem, known, finer))
+    first = partial(first_step, baseline.fit, terms, options, generator, baseline.free, known.keep_search)
+    search = known.continued("confirming the first finding", first)
+    under_better_noise = partial(_under_better_noise, baseline, search, known, generator, progress)
+    search = known.improved("trying effects under a more likely noise model", under_better_noise, search)
+    at_smaller_step = partial(_at_smaller_step, problem, known, search)
+    repeated = known.improved("halving the step of integration", at_smaller_step, search)
+    if repeated is not search:
+        return repeated
     known.keep_search(search)
     while search.left:
-        progress(f"trying {len(search.left)} effects in addition to {len(search.found)} found")
-        before, search = search, next_step(search, options, generator, known.keep_search)
+        stage = f"trying {len(search.left)} effects in addition to {len(search.found)} found"
+        progress(stage)
+        further = partial(next_step, search, options, generator, known.keep_search)
+        before, search = search, known.continued(stage, further, search)
         known.keep_search(search)
         if search.found == before.found:
             break
     if len(search.found) > 1:
-        progress("comparing the findings again with their rivals")
-        search = eliminated(revised(search, options), options)
+        stage = "comparing the findings again with their rivals"
+        progress(stage)
+        search = known.improved(stage, partial(revised, search, options), search)
+        search = known.improved(
+            "removing findings that the others replace", partial(eliminated, search, options), search
+        )
         known.keep_search(search)
     return search
 
 
 def _under_better_noise(
-    baseline: ProcessNoiseFit, search: StepwiseSearch, known: PartialResult
-) -> ProcessNoiseFit | None:
-    """Return the baseline under the noise that the search found with its candidate; None if it is not more likely."""
+    baseline: ProcessNoiseFit,
+    search: StepwiseSearch,
+    known: PartialResult,
+    generator: torch.Generator,
+    progress: Callable[[str], object],
+) -> StepwiseSearch:
+    """Repeat the first search under the noise that it found with its candidate, if that is more likely."""
     fit = None if search.first is None else search.first.without_candidate
     if fit is None:
-        return None
-    declared, settings = known.options.declared, known.options.settings
-    noise = estimate_noise(fit, declared, settings.noise, noise_of_fit(fit, declared))
-    return None if noise is None or noise.observer is None else replace(baseline, fit=fit, noise=noise)
+        return search
+    options = known.options
+    noise = estimate_noise(fit, options.declared, options.settings.noise, noise_of_fit(fit, options.declared))
+    if noise is None or noise.observer is None:
+        return search
+    better, terms = replace(baseline, fit=fit, noise=noise), known.candidates[1]
+    progress(f"trying {len(terms)} effects under a more likely noise model")
+    known.keep_baseline(better, with_noise=True)
+    return first_step(better.fit, terms, options, generator, better.free, known.keep_search)
+
+
+def _at_smaller_step(problem: Problem, known: PartialResult, search: StepwiseSearch) -> StepwiseSearch:
+    """Repeat the whole search with half the step of integration, if the finding depends on the step."""
+    finer = with_smaller_step(search.found[-1].fit, known.options.settings.noise) if search.found else None
+    return search if finer is None else stepwise_search(problem, known, fit_baseline(problem, known, finer))
 
 
 def fit_baseline(problem: Problem, known: PartialResult, prepared: PreparedSimulation | None = None) -> ProcessNoiseFit:
