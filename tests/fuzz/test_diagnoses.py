@@ -22,5 +22,6 @@ def test_a_seed_draws_the_same_recording_again():
 
 
 @pytest.mark.slow
-def test_a_long_recording_with_a_hidden_lag_is_diagnosed_without_an_internal_error():
-    assert crash_of(1) == ("lag of the valve", "")
+def test_a_long_recording_with_a_hidden_store_is_diagnosed_without_an_internal_error():
+    # the shape of the finding has faster tangents than the simulation's parameters
+    assert crash_of(4, limit=180.0) == ("second store", "")
