@@ -75,13 +75,13 @@ def recording_of(seed: int, samples: int = SAMPLES) -> tuple[str, Recording]:
     hold = math.ceil(10.0 ** uniform(0.0, 2.0))
     levels = 10.0 * torch.rand(samples // hold + 1, generator=g, dtype=torch.float64)
     flow = levels.repeat_interleave(hold)[:samples]
-    pushes = normal(10.0 ** uniform(-3.0, -0.5)).tolist()
+    disturbances = normal(10.0 ** uniform(-3.0, -0.5)).tolist()
     x, z, course = 20.0, 0.0, []
-    for push, u in zip(pushes, flow.tolist(), strict=True):
+    for disturbance, u in zip(disturbances, flow.tolist(), strict=True):
         course.append(x)
         for _ in range(FINE):
             rate, hidden_rate = HIDDEN[hidden](x, z, u)
-            x, z = x + STEP / FINE * (rate + push), z + STEP / FINE * hidden_rate
+            x, z = x + STEP / FINE * (rate + disturbance), z + STEP / FINE * hidden_rate
     noise = normal(10.0 ** uniform(-2.0, 0.0))
     outliers = torch.rand(samples, generator=g) < uniform(0.0, 0.1)
     measured = torch.tensor(course, dtype=torch.float64) + noise * torch.where(outliers, 30.0, 1.0)
