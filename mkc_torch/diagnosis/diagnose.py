@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from time import monotonic
 
 from mkc_torch._parallel.deadline import Stopped, limited
 from mkc_torch._parallel.progress import counting
+from mkc_torch.diagnosis.optional import optional_steps
 from mkc_torch.diagnosis.pipeline.partial import PartialResult, build_result, cut_short, estimate, run_tests
-from mkc_torch.diagnosis.pipeline.prepare import SearchOptions, prepare
+from mkc_torch.diagnosis.pipeline.prepare import Problem, SearchOptions, prepare
 from mkc_torch.diagnosis.pipeline.search import fit_baseline, stepwise_search
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.settings import Settings
@@ -103,7 +105,14 @@ def diagnose(
     problem = prepare(simulation, recording, effects, options, time_limit, progress)
     limit = math.inf if time_limit is None else time_limit
     known = PartialResult(problem)
-    with limited(limit, begin=begin) as deadline, counting(progress):
+    with optional_steps() as failed:
+        result = _result_of(problem, known, limit, begin)
+    return replace(result, warnings=(*result.warnings, *failed))
+
+
+def _result_of(problem: Problem, known: PartialResult, limit: float, begin: float) -> Diagnosis:
+    """Return the result of the stages, or of those before the time limit."""
+    with limited(limit, begin=begin) as deadline, counting(problem.progress):
         try:
             baseline = fit_baseline(problem, known)
             steps = stepwise_search(problem, known, baseline)

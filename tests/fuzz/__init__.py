@@ -1,1 +1,1 @@
-"""Fuzzing, which is run by hand: `python -m tests.fuzz.readers --minutes 60`."""
+"""Fuzzing, which is run by hand: `python -m tests.fuzz.readers` and `python -m tests.fuzz.diagnoses`."""

@@ -12,7 +12,8 @@ from mkc_torch.diagnosis.evidence import TESTS
 from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, EvidenceTest
 from mkc_torch.diagnosis.evidence.prediction import held_out_gain_evidence, held_out_gain_result
 from mkc_torch.diagnosis.evidence.residual_noise import localised_evidence, rejected_evidence, whiteness_evidence
-from mkc_torch.diagnosis.search.estimate import FinalEstimate, estimate
+from mkc_torch.diagnosis.optional import optional
+from mkc_torch.diagnosis.search.estimate import FinalEstimate, estimate, rough_estimate
 
 
 def in_short(*, held_out: bool) -> tuple[EvidenceTest, ...]:
@@ -64,7 +65,7 @@ def precompute(case: EvidenceContext, tests: Sequence[EvidenceTest] = TESTS) -> 
     """Return independent tasks: the ``ahead`` function of each test, and last the final estimate, which takes
     longest.
     """
-    return [*(partial(_ahead, test, case) for test in _long(case, tests)), partial(_final, case)]
+    return [*(partial(_ahead, test, case) for test in _long(case, tests)), partial(final_of, case)]
 
 
 def all_results(case: EvidenceContext, tests: Sequence[EvidenceTest], known: Iterable[object] = ()) -> EvidenceReport:
@@ -75,17 +76,33 @@ def all_results(case: EvidenceContext, tests: Sequence[EvidenceTest], known: Ite
 def results_of_tests(
     case: EvidenceContext, done: Sequence[Any], tests: Sequence[EvidenceTest] = TESTS
 ) -> EvidenceReport:
-    """Run the tests in their order, with the results of :func:`precompute`."""
+    """Run the tests in their order, with the results of :func:`precompute`; a test that fails has no result."""
     *ahead, final = done
     case = replace(case, estimate=final)
     known = dict(zip(_long(case, tests), ahead, strict=True))
     results: list[tuple[int | None, EvidenceResult]] = []
     for test in tests:
         cases = _cases(test, case)
-        for test_case, done_ahead in zip(cases, known.get(test, [None] * len(cases)), strict=True):
-            result = test.test(replace(test_case, ahead=done_ahead))
-            results.append((test_case.number if test.each_finding else None, result))
+        done_ahead = known.get(test, [None] * len(cases))
+        if done_ahead is not None:
+            work = partial(_results_of, test, cases, done_ahead)
+            results += optional(_step_of(test), work, list)
     return EvidenceReport(case, tuple(results))
+
+
+def _results_of(
+    test: EvidenceTest, cases: Sequence[EvidenceContext], done_ahead: Sequence[Any]
+) -> list[tuple[int | None, EvidenceResult]]:
+    """Return the results of a test, with the number of their findings."""
+    return [
+        (case.number if test.each_finding else None, test.test(replace(case, ahead=done)))
+        for case, done in zip(cases, done_ahead, strict=True)
+    ]
+
+
+def _step_of(test: EvidenceTest) -> str:
+    """Name of a test in a warning."""
+    return f"test of evidence: {test.test.__name__.removesuffix('_evidence').replace('_', ' ')}"
 
 
 def _long(case: EvidenceContext, tests: Sequence[EvidenceTest]) -> list[EvidenceTest]:
@@ -98,10 +115,18 @@ def _cases(test: EvidenceTest, case: EvidenceContext) -> list[EvidenceContext]:
     return [replace(case, number=k) for k in range(len(case.found))] if test.each_finding else [case]
 
 
-def _ahead(test: EvidenceTest, case: EvidenceContext) -> list[Any]:
-    assert test.ahead is not None
-    return [test.ahead(_case) for _case in _cases(test, case)]
+def _ahead(test: EvidenceTest, case: EvidenceContext) -> list[Any] | None:
+    """Return the results of the expensive part of a test; None if it fails."""
+    ahead = test.ahead
+    assert ahead is not None
+    return optional(_step_of(test), lambda: [ahead(_case) for _case in _cases(test, case)], lambda: None)
 
 
-def _final(case: EvidenceContext) -> FinalEstimate:
-    return estimate(case.fit, case.settings.noise).at_least(case.held_out[-1].jackknife)
+def final_of(case: EvidenceContext) -> FinalEstimate:
+    """Return the final parameters, with errors no smaller than those over the held-out blocks."""
+    error = case.held_out[-1].jackknife
+    return optional(
+        "standard errors under coloured noise",
+        lambda: estimate(case.fit, case.settings.noise).at_least(error),
+        lambda: rough_estimate(case.fit, error),
+    )

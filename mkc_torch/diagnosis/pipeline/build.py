@@ -28,6 +28,7 @@ from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, estimate_no
 from mkc_torch.diagnosis.model.shapes import described
 from mkc_torch.diagnosis.model.term import Drivers, Term
 from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
+from mkc_torch.diagnosis.optional import optional
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.search_notes import significance
 from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Finding, Separability, Stop, Traces, notices
@@ -265,12 +266,21 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
 def _finding(
     found: Sequence[SearchResult], number: int, final: FinalEstimate, whole: DiagnosisInputs, answers: EvidenceReport
 ) -> Finding:
-    """Return a finding with its evidence, shape check and grade."""
+    """Return a finding with its evidence, shape check and grade; by its evidence alone if a test failed."""
     quick = whole.options.quick
     finding = replace(finding_of(found[number], final, number, quick=quick), evidence=answers.of_findings[number])
     finding = replace(finding, clearly_better=_clearly_better(answers.case.fits, number, whole.options.settings.naming))
-    if whole.in_short:
-        return replace(finding, grade=grade_in_short(finding))
+    in_short = replace(finding, grade=grade_in_short(finding))
+    if whole.in_short or not any(result.test == "held_out" for result in finding.evidence):
+        return in_short
+    step = f"testing the shape of {finding.effect}, and its alternatives"
+    return optional(step, partial(_graded, finding, found, number, final, whole), lambda: in_short)
+
+
+def _graded(
+    finding: Finding, found: Sequence[SearchResult], number: int, final: FinalEstimate, whole: DiagnosisInputs
+) -> Finding:
+    """Return a finding with its shape check, the parameters of its alternatives, and its grade."""
     others = with_parameters(finding.alternatives, found[number], final, number, whole.options.settings.noise)
     shape = None
     if whole.final.model.prepared.dynamics is not None:
@@ -296,21 +306,24 @@ def _clearly_better(fits: Sequence[FittedModel], number: int, naming: NamingSett
 def _assessment(whole: DiagnosisInputs) -> FitAssessment:
     """Assess the fits; after a stop only as far as the time limit of a part allows."""
     settings, declared = whole.options.settings.noise, whole.options.declared
-    if whole.stop is None:
-        return assess(whole.base, whole.final, declared, settings)
-    known = within(_MOMENT_S, partial(assess, whole.base, whole.final, declared, settings))
-    if known is not None:
-        return known
-    # the goodness of fit with the findings is unknown, so the verdict cannot be unfit
-    follows = () if whole.final.model.terms else assess_baseline(whole.base, declared)
-    return FitAssessment(follows, (), None, impossible_rotations(whole.base))
+    work = partial(assess, whole.base, whole.final, declared, settings)
+
+    def bare() -> FitAssessment:
+        # the goodness of fit with the findings is unknown, so the verdict cannot be unfit
+        follows = () if whole.final.model.terms else assess_baseline(whole.base, declared)
+        return FitAssessment(follows, (), None, impossible_rotations(whole.base))
+
+    if whole.stop is not None:
+        return within(_MOMENT_S, work) or bare()
+    return optional("assessing the fit with the findings", work, bare)
 
 
 def _environment(whole: DiagnosisInputs, known: FitAssessment, *, unfit: bool) -> NoiseEnvironment:
-    if whole.stop is None:
-        return noise_environment(whole.base, whole.final, known, unfit=unfit)
-    noise = within(_MOMENT_S, partial(noise_environment, whole.base, whole.final, known, unfit=unfit))
-    return NoiseEnvironment(known.follows, starts=whole.base.starts) if noise is None else noise
+    work = partial(noise_environment, whole.base, whole.final, known, unfit=unfit)
+    bare = NoiseEnvironment(known.follows, starts=whole.base.starts)
+    if whole.stop is not None:
+        return within(_MOMENT_S, work) or bare
+    return optional("describing the disturbances", work, lambda: bare)
 
 
 def _p_value(first: SearchResult | None, whole: DiagnosisInputs) -> float | None:

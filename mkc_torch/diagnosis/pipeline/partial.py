@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -11,18 +11,18 @@ from mkc_torch.diagnosis.evidence import TESTS
 from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceTest
 from mkc_torch.diagnosis.evidence.held_out import Evidence, blocks_of, on_all
 from mkc_torch.diagnosis.evidence.prediction import OpenLoop, open_loop_evidence, running_unjudged
-from mkc_torch.diagnosis.evidence.run import EvidenceReport, all_results, in_short, results_of_tests
+from mkc_torch.diagnosis.evidence.run import EvidenceReport, all_results, final_of, in_short, results_of_tests
 from mkc_torch.diagnosis.findings.noise import offsets_of, runs_of, shared_offsets
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, first_samples
 from mkc_torch.diagnosis.model.shapes import candidates_of, within_a_sample
 from mkc_torch.diagnosis.model.term import Drivers, Term, common_parts
+from mkc_torch.diagnosis.optional import optional
 from mkc_torch.diagnosis.pipeline.build import DiagnosisInputs, build_diagnosis
 from mkc_torch.diagnosis.pipeline.prepare import Problem
 from mkc_torch.diagnosis.pipeline.search_notes import with_search_notes
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.result import Diagnosis, Stop
-from mkc_torch.diagnosis.search.estimate import estimate as final_estimate
 from mkc_torch.diagnosis.search.run import SearchResult
 
 
@@ -59,6 +59,39 @@ class PartialResult:
     def keep_search(self, search: StepwiseSearch) -> None:
         """Store the search so far."""
         self.search = search
+
+    def continued(
+        self, step: str, work: Callable[[], StepwiseSearch], before: StepwiseSearch | None = None
+    ) -> StepwiseSearch:
+        """Return the search after a step that keeps its parts; after an internal error the search as far as it is kept.
+
+        Args:
+            step: its name in a warning.
+            work: the step.
+            before: the search before the step; None for the first search, which together with the scores of the
+                simulation without findings is needed for any result.
+        """
+        earlier = self.search if before is None else None  # of another fit of the simulation
+
+        def kept() -> StepwiseSearch:
+            assert self.search is not None
+            # without a finding there is nothing to continue from
+            return self.search if self.search.found else replace(self.search, left=())
+
+        def is_kept() -> bool:
+            return self.search is not None and self.search is not earlier and bool(self.search.evidence)
+
+        return optional(step, work, kept, is_kept)
+
+    def improved(self, step: str, work: Callable[[], StepwiseSearch], before: StepwiseSearch) -> StepwiseSearch:
+        """Return the search after a step; after an internal error the search and the baseline before the step."""
+        state = dict(vars(self))
+
+        def unchanged() -> StepwiseSearch:
+            vars(self).update(state)
+            return before
+
+        return optional(step, work, unchanged)
 
     @property
     def tests(self) -> tuple[EvidenceTest, ...]:
@@ -133,8 +166,13 @@ class PartialResult:
 
 def estimate(known: PartialResult, search: StepwiseSearch) -> EvidenceContext:
     """The fourth stage: the fits with the findings in open loop, which sizes and figures are taken from."""
-    known.problem.progress("checking what was found")
-    return known.case(search)
+    stage = "checking what was found"
+    known.problem.progress(stage)
+    return optional(
+        stage,
+        lambda: known.case(search),
+        lambda: known.case(search, OpenLoop(known.base, search.found, search.evidence)),
+    )
 
 
 def run_tests(known: PartialResult, search: StepwiseSearch, case: EvidenceContext) -> EvidenceReport:
@@ -190,7 +228,7 @@ def cut_short(known: PartialResult, reason: Reason, seconds: float, limit: float
     if free is None:
         free = OpenLoop(known.base, found, search.evidence)
     case = known.case(search, free)
-    final = final_estimate(case.fit, known.options.settings.noise).at_least(case.held_out[-1].jackknife)
+    final = final_of(case)
     stop = Stop(reason, seconds, tuple(_not_done(known, search, judged=judged, leading=bool(leading))))
     return known.diagnosis(search, results_of_tests(case, [final], in_short(held_out=judged)), stop)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 
 from mkc_torch.diagnosis.model.fit import FittedModel
@@ -34,21 +36,31 @@ def stepwise_search(problem: Problem, known: PartialResult, baseline: ProcessNoi
     terms = () if impossible_rotations(baseline) else known.candidates[1]
     progress(f"trying {len(terms)} effects")
     if baseline.fit.model.prepared.dynamics is not None:
-        search = search_models(baseline, terms, options, generator, known.keep_search)
-        finer = with_smaller_step(search.found[-1].fit, options.settings.noise) if search.found else None
-        if finer is not None:
-            return stepwise_search(problem, known, fit_baseline(problem, known, finer))
-        known.keep_search(search)
-        return search
-    search = first_step(baseline.fit, terms, options, generator, known.keep_search)
+        whole = partial(search_models, baseline, terms, options, generator, known.keep_search)
+        search = known.continued("searching models", whole)
+        repeated = known.improved(
+            "halving the step of integration", partial(_at_smaller_step, problem, known, search), search
+        )
+        known.keep_search(repeated)
+        return repeated
+    first = partial(first_step, baseline.fit, terms, options, generator, known.keep_search)
+    search = known.continued("confirming the first finding", first)
     known.keep_search(search)
     while search.left:
-        progress(f"trying {len(search.left)} effects in addition to {len(search.found)} found")
-        before, search = search, next_step(search, options, generator, known.keep_search)
+        stage = f"trying {len(search.left)} effects in addition to {len(search.found)} found"
+        progress(stage)
+        further = partial(next_step, search, options, generator, known.keep_search)
+        before, search = search, known.continued(stage, further, search)
         known.keep_search(search)
         if search.found == before.found:
             break
     return search
+
+
+def _at_smaller_step(problem: Problem, known: PartialResult, search: StepwiseSearch) -> StepwiseSearch:
+    """Repeat the whole search with half the step of integration, if the findings depend on the step."""
+    finer = with_smaller_step(search.found[-1].fit, known.options.settings.noise) if search.found else None
+    return search if finer is None else stepwise_search(problem, known, fit_baseline(problem, known, finer))
 
 
 def fit_baseline(problem: Problem, known: PartialResult, prepared: PreparedSimulation | None = None) -> ProcessNoiseFit:

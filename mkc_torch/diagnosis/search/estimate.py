@@ -207,6 +207,14 @@ def estimate(fit: FittedModel, settings: NoiseSettings) -> FinalEstimate:
     )
 
 
+def rough_estimate(fit: FittedModel, error: Float[Tensor, " p"]) -> FinalEstimate:
+    """Return a fit with known standard errors of its parameters, as if the noise were white."""
+    level = robust_scale(fit.residual)
+    white = NoiseSpectrum(tuple(level.new_zeros(0) for _ in level), level.expand_as(fit.residual))
+    noise = NoiseFit(0, 0.0, float(level.square().mean()), math.nan, 0.0)
+    return FinalEstimate(fit, torch.diag(error.square()), noise, white, 0.0, tuple({} for _ in fit.model.terms))
+
+
 def within_bounds(
     parameters: Float[Tensor, " p"],
     step: Float[Tensor, " p"],

@@ -60,15 +60,22 @@ class CosineProjection:
 
     @classmethod
     def of(
-        cls, pseudo: Float[Tensor, "N m"], counts: Float[Tensor, "N m"], tangents: ModelTangents, slow: SlowBasis | None
+        cls,
+        pseudo: Float[Tensor, "N m"],
+        counts: Float[Tensor, "N m"],
+        tangents: ModelTangents,
+        slow: SlowBasis | None,
+        spectrum: NoiseSpectrum | None = None,
     ) -> CosineProjection:
         """Project all samples; candidates are processed a few at a time, and only their coefficients are kept.
 
         Args:
             pseudo, counts, tangents: of all samples.
             slow: the drift's cosines; None without a drift.
+            spectrum: a known spectrum, whose K is used; None for K by the bandwidth of the parameters' tangents.
         """
-        kept = _bandwidth(tangents.nuisance)
+        # a spectrum known from fewer parameters has the K of their tangents, which can be another
+        kept = _bandwidth(tangents.nuisance) if spectrum is None else len(spectrum.root)
 
         def moved(joined: Tensor) -> Tensor:
             return dct(counts.unsqueeze(-1) * joined, kept)
@@ -262,12 +269,13 @@ def linearise(
         white: treat noise other than the drift as white.
         drift: allow for a drift at the ports.
         joint: the only candidate is the vector of all parameters, to be estimated together.
-        seen: result of :meth:`CosineProjection.of` for the same arguments, if known.
+        seen: result of :meth:`CosineProjection.of` for the same arguments and the same K, if known.
     """
     m = pseudo.shape[1]
     prior_rows = _PriorRows.of(model, parameters)
     slow = tangents.slow if drift else None
-    seen = CosineProjection.of(pseudo, counts, tangents, slow) if seen is None else seen
+    known = near if spectrum is None else spectrum
+    seen = CosineProjection.of(pseudo, counts, tangents, slow, known) if seen is None else seen
     level = pseudo.new_ones(seen.kept, m) * _level(pseudo)
     plain = NoiseSpectrum(tuple(pseudo.new_zeros(0) for _ in range(m)), level)
     if white:

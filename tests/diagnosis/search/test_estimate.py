@@ -1,6 +1,7 @@
 """The final step of generalised least squares."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,9 +10,13 @@ from hypothesis import strategies as st
 
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.estimate import estimate, within_bounds
+from mkc_torch.diagnosis.search.linearise import CosineProjection, linearise
 from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import NoiseSettings
+from mkc_torch.effects import GainEffect, Quantity
+from mkc_torch.simulation import Port
 from tests.diagnosis.line import Line
 
 
@@ -57,6 +62,67 @@ def tangents_before(line):
         return found
 
     return then_not_finite
+
+
+class Chirp(GainEffect):
+    """A sine of two fitted numbers, fast in a recording of :class:`Line`."""
+
+    id, port = "chirp", "left"
+    fitted_shape = {"frequency": (50.0, 5000.0), "rise": (1.0, 500.0)}
+
+    def quantities(self, shape, context):
+        return (Quantity("gain", 1, "V"),)
+
+    def waveform(self, shape, context):
+        time = context.time
+        return torch.sin((shape["frequency"] + shape["rise"] * time) * time)
+
+
+class LineWithChirp(Line):
+    """A line whose left channel has an effect of its own, fast compared with the line."""
+
+    ports = {**Line.ports, "left": Port(("left",), "V")}
+
+    def __init__(self, N, *terms):
+        super().__init__(N)
+        for frequency, rise in terms:
+            self.measured[:, 0] += torch.sin((frequency + rise * self.time) * self.time)
+
+    def residual(self, theta, changes):
+        left = super().residual(theta, changes)
+        if "left" in changes:
+            change = changes["left"](self.time.new_zeros(len(self.time), 1))
+            left = left - torch.cat([change, torch.zeros_like(change)], -1)
+        return left
+
+
+def test_shape_numbers_have_errors_if_their_tangents_are_faster_than_those_of_the_other_parameters():
+    shapes = [(2000.0, 30.0), (2600.0, 20.0)]
+    line = LineWithChirp(1500, *shapes)
+    terms = [Term(Chirp(), None, {"frequency": frequency, "rise": rise}) for frequency, rise in shapes]
+    fit = fitted(JointModel(line, terms), torch.tensor([1.0, 0.5, 1.0, 1.0], dtype=torch.float64))
+    tangents = tangents_of(fit.model, fit.parameters, NoiseSettings())
+    # the case that matters: with the shapes, most tangents are fast
+    values, counts = fit.pseudo(NoiseSettings())
+    fast = replace(tangents, nuisance=tangents.nuisance[..., 2:])
+    kept = [CosineProjection.of(values, counts, known, None).kept for known in (tangents, fast)]
+    assert kept[0] < kept[1]
+    found = estimate(fit, NoiseSettings())
+    for errors in found.shape_errors:
+        assert 0.0 < errors["frequency"] < 1.0
+
+
+def test_a_known_spectrum_sets_the_number_of_coefficients():
+    line = LineWithChirp(1500)
+    model = JointModel(line)
+    fit = fitted(model, line.start())
+    tangents = tangents_of(model, fit.parameters, NoiseSettings())
+    values, counts = fit.pseudo(NoiseSettings())
+    known = linearise(model, fit.parameters, values, counts, tangents, drift=False).spectrum
+    fast = replace(tangents, nuisance=line.mixing[..., :2])
+    again = linearise(model, fit.parameters, values, counts, fast, spectrum=known, drift=False)
+    near = linearise(model, fit.parameters, values, counts, fast, near=known)
+    assert len(known.root) == len(again.spectrum.root) == len(near.spectrum.root) < 1500
 
 
 @given(seed=st.integers(0, 2**32 - 1), size=st.integers(1, 6), width=st.floats(0.01, 3.0))
