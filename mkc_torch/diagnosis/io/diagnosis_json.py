@@ -14,7 +14,6 @@ from typing import Any
 from torch import Tensor
 
 from mkc_torch.diagnosis.environment import DisturbanceEstimate, NoiseEnvironment, ProcessNoise, ShapeCheck
-from mkc_torch.diagnosis.findings.warnings import diagnosis_doubts
 from mkc_torch.diagnosis.result import (
     Diagnosis,
     EffectParameter,
@@ -25,6 +24,7 @@ from mkc_torch.diagnosis.result import (
     NoiseSummary,
     Number,
 )
+from mkc_torch.diagnosis.verdict import conclusion
 
 _MOST_POINTS = 500
 """Largest number of samples of a disturbance that are written."""
@@ -172,7 +172,7 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "level": d.level,
         "p_value": d.p_value,
         "verdict": d.verdict,
-        "doubts": diagnosis_doubts(d),
+        "doubts": conclusion(d).doubts,
         "goodness_of_fit": goodness_of_fit_json(d.environment),
         "reasons": d.environment.reasons,
         **recordings_json(d.environment),
