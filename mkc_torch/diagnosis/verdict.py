@@ -141,7 +141,7 @@ def _on_all(
         text = "The noise model includes the residual's correlation."
     yield _decision("white_residual", left.lag, 0.0, passed=left.lag == 0, sentence=text)
     yield _disturbed_state(known, findings=findings)
-    text = " ".join(left.structure) or "No structure remains."
+    text = " ".join(left.structure) or "The findings leave no structure."
     yield _decision("structure_left", len(left.structure), 0.0, passed=not left.structure, sentence=text)
     yield from _above_declared_noise(known.corrected if findings else known.follows, settings)
     if left.stop is not None:

@@ -68,7 +68,7 @@ def held_out_blocks(finding: Finding, context: VetoContext) -> Decision | None:
     if held is None or (context.in_short and not held.decides):
         if not context.in_short:
             return None
-        text = "Not confirmed: a quick look or a stopped search confirms by held-out blocks only, and they do not."
+        text = "A quick look or a stopped search confirms by held-out blocks only, and no such gain is known."
         return _decision("held_out_blocks", finding, context, None, 0.0, passed=False, sentence=text)
     gain, low = held.log_likelihood_gain, held.confidence_interval[0]
     kind = confirmation(gain, held.confidence_interval)
