@@ -24,8 +24,8 @@ from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request, is_f
 from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.cli.recorded import read_magnetometer, read_table, refuse_no_magnetometer
 from mkc_torch.diagnosis import Diagnosis, diagnose
-from mkc_torch.diagnosis.findings.warnings import diagnosis_doubts
 from mkc_torch.diagnosis.io.python_source import SourceError
+from mkc_torch.diagnosis.verdict import conclusion
 from mkc_torch.recording.column_names import split_unit
 from mkc_torch.recording.join_recordings import joint_name
 from mkc_torch.recording.recording import Recording, RecordingError
@@ -223,7 +223,7 @@ def _outcome(
         return _failed(path, label, own or error)
     stopped = diagnosis.stop is not None and diagnosis.stop.reason == "interrupt"
     text = look.set(lambda console: show(console, diagnosis, files, paths))
-    return Outcome(text, failed=False, interrupted=stopped, doubtful=bool(diagnosis_doubts(diagnosis)))
+    return Outcome(text, failed=False, interrupted=stopped, doubtful=conclusion(diagnosis).doubtful)
 
 
 def _paths(path: Path, folder: Path, request: Request) -> RunPaths | None:

@@ -12,6 +12,7 @@ from rich.text import Text
 from mkc_torch._support.typesetting import plain, typeset
 from mkc_torch.cli.remarks import note_rows, warning_rows
 from mkc_torch.diagnosis.result import Diagnosis, Finding
+from mkc_torch.diagnosis.verdict import Status
 from mkc_torch.report.diagnosis import environment, noise, numbers, unseen
 from mkc_torch.report.diagnosis import findings as sentences
 from mkc_torch.report.diagnosis import verdict as top
@@ -25,7 +26,7 @@ _MOST_LINES = 6
 
 _REPORT = "report.html"
 
-_STYLE: dict[top.Tone, str] = {"good": "bold green", "found": "bold cyan", "faint": "bold", "open": "bold yellow"}
+_STYLE: dict[Status, str] = {"good": "bold green", "found": "bold cyan", "faint": "bold", "open": "bold yellow"}
 
 
 def show(console: Console, diagnosis: Diagnosis, files: list[Path], paths: top.RunPaths | None = None) -> None:
@@ -38,7 +39,7 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path], paths: top.R
     console.print(Text(heading, style="bold"))
     for notice in top.notices_first(d):
         console.print(Text(notice, style="bold yellow"))
-    console.print(Text(top.headline(d), style=_STYLE[top.tone(d)]))
+    console.print(Text(top.headline(d), style=_STYLE[top.status(d)]))
     console.print(_facts(_four_answers(d)))
     for i, finding in enumerate(d.findings, 1):
         if len(d.findings) > 1:

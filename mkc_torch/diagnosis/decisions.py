@@ -33,15 +33,17 @@ class ScoredModel:
 
 @dataclass(frozen=True)
 class Decision:
-    """A rule applied to a finding.
+    """A rule applied to a finding, or to the whole diagnosis.
 
     Attributes:
         rule: its id, such as "p_value" or "held_out_blocks".
-        subject: the finding, spelled as ``--suspect`` accepts it.
+        subject: the finding, spelled as ``--suspect`` accepts it; empty for the whole diagnosis.
         value: the number compared; None where it is unknown.
         threshold: the number it is compared with.
-        passed: False if the rule lowers the grade of the finding or refuses it.
+        passed: False if the rule lowers the grade of the finding, refuses it, or lowers the verdict.
         sentence: the decision for a reader.
+        finding: number of the finding, from 1; 0 for a decision of the search or on the whole diagnosis, whose subject
+            is empty.
     """
 
     rule: str
@@ -50,6 +52,7 @@ class Decision:
     threshold: float
     passed: bool
     sentence: str
+    finding: int = 0
 
 
 @dataclass(frozen=True)

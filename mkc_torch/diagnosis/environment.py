@@ -110,12 +110,14 @@ class ShapeCheck:
         p_value: of that gain if the name is right.
         curve: the free curve if it is clearly better; otherwise None.
         formula: the formula nearest to the curve, such as "0.0071 |x|^1.52 sign(x)"; empty if there is no formula.
+        needed: the gain in nats above which the curve is clearly better.
     """
 
     free_curve_gain: float
     p_value: float
     curve: Curve | None = None
     formula: str = ""
+    needed: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -187,6 +187,9 @@ class Finding:
     ``kind`` is the quantity it acts on, such as "temperature"; empty if unknown.
     ``cannot_be`` is True if its size is impossible, see ``plausibility``; ``doubts`` are sentences about numbers of its
     shape at the ends of their ranges.
+    ``times_plausible`` is its size as a multiple of the largest plausible size; None if that is unknown.
+    ``shown_share`` is the share of the change of a sensor's vector that its compared length shows; None where each
+    component is compared.
     ``clearly_better`` is True if the open-loop fit without it is clearly less likely, whatever the error of its size.
     ``p_value`` is that after the whole search; None in a quick look, which draws no surrogates.
     ``grade`` rates the finding; ``shape`` checks its named shape, None if not checked.
@@ -217,6 +220,8 @@ class Finding:
     kind: Kind = ""
     cannot_be: bool = False
     doubts: tuple[str, ...] = ()
+    times_plausible: float | None = None
+    shown_share: float | None = None
     clearly_better: bool = False
     grade: Grade = "left_out"
     shape: ShapeCheck | None = None

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from mkc_torch._parallel.deadline import Reason
 from mkc_torch._support.html_table import html_table
 from mkc_torch._support.typesetting import plain, typeset
+from mkc_torch.diagnosis.decisions import Trail
 from mkc_torch.diagnosis.environment import NoiseEnvironment, Verdict
 from mkc_torch.diagnosis.parts import (
     Alternative,
@@ -198,6 +199,7 @@ class Diagnosis:
         recordings: names of the recordings that were diagnosed together; empty for a single recording.
         quick: True for a quick look, which draws no surrogates: no p-values, and an unknown rate of false alarms.
         stop: why the search was stopped before its end, and what was not done; None if it was not stopped.
+        decisions: the models that were scored, and the decisions that findings, grades and verdict follow from.
 
     Example:
         >>> import torch
@@ -238,6 +240,7 @@ class Diagnosis:
     quick: bool = False
     stop: Stop | None = None
     notes: tuple[str, ...] = ()
+    decisions: Trail = field(default_factory=Trail)
 
     def __repr__(self) -> str:
         found = ", ".join(finding.effect for finding in self.findings) or "nothing found"

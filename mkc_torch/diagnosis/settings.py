@@ -263,6 +263,9 @@ class EvidenceSettings(_Stage):
         followed: share of an output's variation that the open-loop simulation has to explain for a good fit.
         useful: mean explained share over all outputs that the best model has to reach open loop, if the simulation's
             fit is poor, for a verdict other than unfit.
+        correction: ratio of what the findings explain of the outputs' variation in addition, to what the simulation
+            explains without them, above which signs and units are doubted: by definition, at 1 the correction is larger
+            than the simulation.
         above_floor: ratio to a declared noise floor above which a residual is more than the sensor's noise.
         shape_level: p-value of a free curve's gain below which a name is only the nearest in the catalogue, and
         shape_nats: the gain that the curve needs beyond Schwarz's penalty of its numbers.
@@ -287,6 +290,7 @@ class EvidenceSettings(_Stage):
     white_level: float = 0.01
     followed: float = 0.5
     useful: float = 0.35
+    correction: float = 1.0
     above_floor: float = 1.5
     shape_level: float = 0.001
     shape_nats: float = 6.0

@@ -139,10 +139,10 @@ def test_an_absent_smooth_correction_is_omitted():
     assert "smooth correction" not in summary_text(make_diagnosis(1, ceiling=None))
 
 
-def test_a_significant_p_value_of_an_adequate_diagnosis_is_in_the_headline():
+def test_a_significant_candidate_without_a_finding_is_unexplained():
     text = flat(summary_text(make_diagnosis(0, p_value=0.04)))
     assert "no missing physics" not in text
-    assert "The strongest candidate is significant" in text
+    assert "The residual has structure that no effect in the catalogue explains" in text
     assert "how sure p = 0.04" in text
 
 

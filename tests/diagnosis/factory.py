@@ -5,6 +5,8 @@ import math
 
 import torch
 
+from mkc_torch.diagnosis import vetoes
+from mkc_torch.diagnosis.decisions import Trail
 from mkc_torch.diagnosis.environment import (
     Curve,
     DisturbanceEstimate,
@@ -15,7 +17,6 @@ from mkc_torch.diagnosis.environment import (
 )
 from mkc_torch.diagnosis.evidence import prediction, remaining
 from mkc_torch.diagnosis.findings.advice import advice_of
-from mkc_torch.diagnosis.findings.grading import grade_of
 from mkc_torch.diagnosis.result import (
     Alternative,
     CandidateScore,
@@ -30,6 +31,8 @@ from mkc_torch.diagnosis.result import (
     SmoothCorrection,
     Traces,
 )
+from mkc_torch.diagnosis.settings import EvidenceSettings
+from mkc_torch.diagnosis.verdict import FitAssessment, Remainder, decisions_on_all, verdict_of
 
 CHANNELS = ("norm", "turn_x", "turn_y", "turn_z")
 CATALOGUE = (
@@ -66,7 +69,6 @@ def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candi
         "surrogates": 199,
         "seed": 0,
         "p_value": 0.005 if findings else 0.37,
-        "verdict": "explained" if findings else "adequate",
         "findings": tuple(graded(f(names, has_time)) for f in found),
         "baseline": HeldOutScore(-1.2345, before, (1.1,) * channels, (0.52,) * channels),
         "corrected": HeldOutScore(-0.9012, after, (math.inf,) * channels, (0.31,) * channels),
@@ -76,6 +78,7 @@ def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candi
         "separability": make_separability(min(candidates, 8)),
         "traces": traces,
     }
+    content["verdict"] = "explained" if findings else _verdict_without_findings(**changes)
     ceiling = changes.pop("ceiling", HeldOutScore(-0.8951, 0.97 * after, (1.4,) * channels, (0.3,) * channels))
     smooth = SmoothCorrection(ceiling, changes.pop("remaining", ()))
     content["evidence"] = () if ceiling is None else (remaining.as_result(smooth),)
@@ -83,9 +86,18 @@ def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candi
     return diagnosis if "advice" in changes else dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
 
 
+def _verdict_without_findings(p_value=1.0, remaining=(), environment=None, **_):
+    """Return the verdict of a diagnosis with these fields."""
+    fits = () if environment is None else environment.goodness_of_fit
+    structure = ("A trend remains.",) if remaining or (p_value is not None and p_value <= 0.05) else ()
+    known, limits = FitAssessment(fits, (), None), EvidenceSettings()
+    decisions = decisions_on_all(known, Remainder(structure), limits, findings=False, flexible=False)
+    return verdict_of(Trail(decisions=decisions))
+
+
 def graded(finding, grade=None):
     """Return a finding with the grade of its evidence, or another grade."""
-    return dataclasses.replace(finding, grade=grade or grade_of(finding))
+    return dataclasses.replace(finding, grade=grade or vetoes.grade(vetoes.decisions_on(finding)))
 
 
 def with_evidence(thing, *results):

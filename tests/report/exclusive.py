@@ -14,8 +14,8 @@ import torch
 from rich.console import Console
 
 from mkc_torch.cli.diagnosis_summary import show
-from mkc_torch.diagnosis.findings.grading import is_zero_within_error, transfers, worth_correcting
 from mkc_torch.diagnosis.result import Diagnosis, Finding
+from mkc_torch.diagnosis.vetoes import is_zero_within_error, transfers, worth_correcting
 from mkc_torch.report.diagnosis.page import diagnosis_report
 from mkc_torch.report.diagnosis.summary import summary
 from mkc_torch.report.diagnosis.verdict import headline, to_do, warned

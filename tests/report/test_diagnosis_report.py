@@ -254,45 +254,46 @@ def test_a_smooth_correction_worse_than_the_findings_is_not_reported():
     assert "smooth correction" in text_of(diagnosis_report(adequate))
 
 
-def headline_and_advice(gain, interval, before, after):
-    """Return headline, tone and advice of a step with this held-out evidence, and the diagnosis."""
+def headline_and_advice(gain, interval, before, after, verdict="explained"):
+    """Return headline, status and advice of a step with this held-out evidence, and the diagnosis."""
     held_out = HeldOut(gain, interval, before, after, "µT")
     diagnosis = first_changed(
         make_diagnosis(1, samples=240), prediction.held_out_gain_result(held_out, ""), alternatives=()
     )
+    diagnosis = dataclasses.replace(diagnosis, verdict=verdict)
     diagnosis = dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
-    return top.headline(diagnosis), top.tone(diagnosis), " ".join(top.to_do(diagnosis)), diagnosis
+    return top.headline(diagnosis), top.status(diagnosis), " ".join(top.to_do(diagnosis)), diagnosis
 
 
 def test_an_unconfirmed_finding_is_excluded_from_headline_advice_and_command():
-    headline, tone, doing, diagnosis = headline_and_advice(0.134, (-0.019, 0.276), 1.74, 1.73)
-    assert headline.startswith("Found, but not confirmed on held-out blocks and too small")
-    assert "hard-iron step" in headline
-    assert tone == "faint"
+    headline, status, doing, diagnosis = headline_and_advice(0.134, (-0.019, 0.276), 1.74, 1.73, verdict="unexplained")
+    assert headline.endswith("too small to be worth correcting: hard-iron step.")
+    assert "Found, but not confirmed on held-out blocks and" in headline
+    assert status == "open"
     assert "Do not correct for hard-iron step yet" in doing
     assert "use the calibration" not in doing
     assert top.apply_command(diagnosis) == ""
     text = text_of(diagnosis_report(diagnosis))
     assert "probably better on held-out blocks, not surely" in text
     assert "mkc apply" not in text
-    assert '<h1 class="faint">' in diagnosis_report(diagnosis)
-    larger, *_ = headline_and_advice(-0.16, (-0.41, 0.09), 0.269, 0.231)
-    assert larger.startswith("Found, but not confirmed on held-out blocks: hard-iron step")
+    assert '<h1 class="bad">' in diagnosis_report(diagnosis)
+    larger, *_ = headline_and_advice(-0.16, (-0.41, 0.09), 0.269, 0.231, verdict="unexplained")
+    assert larger.endswith("Found, but not confirmed on held-out blocks: hard-iron step.")
 
 
 def test_a_finding_that_hardly_reduces_the_residual_is_reported_as_small():
-    headline, tone, doing, diagnosis = headline_and_advice(0.05, (0.03, 0.07), 1.74, 1.70)
+    headline, status, doing, diagnosis = headline_and_advice(0.05, (0.03, 0.07), 1.74, 1.70)
     assert headline.startswith("Real, but small compared with the noise: hard-iron step")
-    assert tone == "faint"
+    assert status == "faint"
     assert "Do not correct for hard-iron step, unless" in doing
     assert "by only 2.3 %" in doing
     assert top.apply_command(diagnosis) == ""
 
 
 def test_a_confirmed_finding_is_reported_as_left_out_of_the_simulation():
-    headline, tone, doing, diagnosis = headline_and_advice(0.31, (0.28, 0.35), 0.9, 0.5)
+    headline, status, doing, diagnosis = headline_and_advice(0.31, (0.28, 0.35), 0.9, 0.5)
     assert headline.startswith("Left out of the simulation: hard-iron step")
-    assert tone == "found"
+    assert status == "found"
     assert doing.startswith("Look for what changed at that time; use the calibration from after the step.")
     assert "The model found here corrects for hard-iron step" in doing
     assert "surely better on held-out blocks" in text_of(diagnosis_report(diagnosis))
@@ -300,13 +301,13 @@ def test_a_confirmed_finding_is_reported_as_left_out_of_the_simulation():
 
 def test_structure_without_a_finding_is_in_the_headline():
     quiet = make_diagnosis(0, samples=240)
-    assert top.tone(quiet) == "good"
+    assert top.status(quiet) == "good"
     rare = make_diagnosis(0, samples=240, p_value=0.04)
-    assert top.headline(rare).startswith("The strongest candidate is significant, but no effect")
+    assert top.headline(rare) == "The residual has structure that no effect in the catalogue explains."
     smooth = make_diagnosis(0, samples=240, remaining=("temperature",))
     assert top.headline(smooth).startswith("The residual has a smooth trend along temperature that no effect")
     for diagnosis in (rare, smooth):
-        assert top.tone(diagnosis) == "open"
+        assert top.status(diagnosis) == "open"
         text = text_of(diagnosis_report(diagnosis))
         assert "no missing physics" not in text
         assert "The simulation can be used" not in text

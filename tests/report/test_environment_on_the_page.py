@@ -71,7 +71,7 @@ def test_the_box_has_the_goodness_of_fit_of_each_output_in_its_unit():
 def test_an_output_of_small_variation_has_no_explained_share():
     still = make_goodness_of_fit(residual=0.0051, variation=0.006, explained=0.2)
     (line,) = environment.output_lines(
-        make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=(still,)))
+        make_diagnosis(0, samples=50, verdict="unexplained", environment=make_environment(goodness_of_fit=(still,)))
     )
     assert line.startswith("angle: residual 0.00510 rad; noise floor 0.00500 rad (declared)")
     assert "explains" not in line
@@ -105,7 +105,7 @@ def test_the_page_of_a_poor_fit_starts_with_it_and_names_no_physics():
 
 def test_the_status_is_good_if_adequate_and_open_if_unfit_or_unexplained():
     quiet = make_diagnosis(0, samples=50, environment=make_environment(process_noise=(), disturbance=()))
-    assert [top.tone(d) for d in (quiet, make_unfit(), disturbed(), make_diagnosis(1, samples=50))] == [
+    assert [top.status(d) for d in (quiet, make_unfit(), disturbed(), make_diagnosis(1, samples=50))] == [
         "good", "open", "open", "found",
     ]  # fmt: skip
 
@@ -334,9 +334,9 @@ def test_names_in_the_environment_are_escaped():
         parse_page(page)
 
 
-def test_a_poor_fit_with_verdict_adequate_is_reported_as_a_poor_fit():
+def test_a_poor_fit_is_reported_as_a_poor_fit():
     lost = make_diagnosis(
         0, samples=50, environment=make_environment(goodness_of_fit=POOR_FITS, process_noise=(), disturbance=())
     )
-    assert top.tone(lost) == "open"
+    assert top.status(lost) == "open"
     assert "does not fit the recording" in top.headline(lost)

@@ -14,13 +14,14 @@ pytest.importorskip("jinja2")
 pytest.importorskip("rich")
 
 from mkc_torch import diagnose
+from mkc_torch.diagnosis.decisions import Trail
 from mkc_torch.diagnosis.environment import NoiseEnvironment, ShapeCheck
 from mkc_torch.diagnosis.evidence import prediction
 from mkc_torch.diagnosis.findings.advice import advice_of
-from mkc_torch.diagnosis.findings.grading import grade_of, is_zero_within_error, with_shape
-from mkc_torch.diagnosis.pipeline.build import FitAssessment, verdict_of
 from mkc_torch.diagnosis.result import Alternative, Diagnosis, DivergedBlock, EffectParameter, HeldOut, ResidualSizes
 from mkc_torch.diagnosis.settings import EvidenceSettings
+from mkc_torch.diagnosis.verdict import FitAssessment, Remainder, decisions_on_all, reservations_of, verdict_of
+from mkc_torch.diagnosis.vetoes import VetoContext, decisions_on, grade, is_dropped
 from mkc_torch.recording import demonstration
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.factory import PROCESS_NOISE, make_diagnosis, make_goodness_of_fit
@@ -74,7 +75,8 @@ def findings(draw, place):
         evidence=(prediction.held_out_gain_result(held, "" if held else "One side of it is too short."),),
     )
     shape = draw(st.none() | st.just(ShapeCheck(40.0, 0.002, finding.curve, "x^1.5")) | st.just(ShapeCheck(0.5, 0.4)))
-    return dataclasses.replace(finding, shape=shape, grade=with_shape(grade_of(finding), shape))
+    finding = dataclasses.replace(finding, shape=shape)
+    return dataclasses.replace(finding, grade=grade(decisions_on(finding)))
 
 
 @dataclasses.dataclass
@@ -93,7 +95,7 @@ class Case:
 def diagnoses(draw):
     """A diagnosis built as `mkc_torch.diagnosis.pipeline.build` does it, with its grades, verdict and advice."""
     found = [draw(findings(place)) for place in ("rate of rate", "rate of angle", "torque")[: draw(st.integers(0, 3))]]
-    found = [item for item in found if not (item.grade == "unconfirmed" and is_zero_within_error(item))]
+    found = [item for item in found if not is_dropped(decisions_on(item))]
     white = draw(st.booleans())
     process_noise = () if draw(st.booleans()) else (dataclasses.replace(PROCESS_NOISE, at_rate=draw(st.booleans())),)
     noise = 0.005 * draw(st.floats(0.9, 1.2) if white and not process_noise else st.floats(1.0, 20.0))
@@ -109,8 +111,20 @@ def diagnoses(draw):
         found = []
     p_value = found[0].p_value if found else draw(st.floats(0.001, 1.0))
     remaining = ("torque",) if draw(st.booleans()) and not lost else ()
-    structure = (p_value <= LEVEL and not found) or bool(remaining)
-    verdict = verdict_of(known, found, structure=structure, white=white, settings=EvidenceSettings())
+    structure = ("A candidate is significant.",) if (p_value <= LEVEL and not found) or remaining else ()
+    left = Remainder(structure, 0.0 if white else 3.0)
+    flexible = bool(found) and draw(st.booleans())
+    corrected = dataclasses.replace(fit, explained=draw(st.sampled_from((0.6, 0.99))))
+    if flexible and not lost:
+        known = dataclasses.replace(known, follows=(dataclasses.replace(fit, explained=0.4),), corrected=(corrected,))
+    of_findings = [
+        one for number, item in enumerate(found, start=1) for one in decisions_on(item, VetoContext(number=number))
+    ]
+    decisions = (
+        *of_findings,
+        *decisions_on_all(known, left, EvidenceSettings(), findings=bool(found), flexible=flexible),
+    )
+    verdict = verdict_of(Trail(decisions=decisions))
     reasons = ("Another start reaches 0.006 rad.",) if verdict == "unfit" else ()
     environment = NoiseEnvironment((fit,), reasons, process_noise, {"torque": "held"})
     made = make_diagnosis(
@@ -125,6 +139,7 @@ def diagnoses(draw):
             baseline=dataclasses.replace(made.baseline, rmse=held[0].rmse_before),
             corrected=dataclasses.replace(made.corrected, rmse=held[-1].rmse_after),
         )
+    made = dataclasses.replace(made, decisions=Trail(decisions=(*decisions, *reservations_of(made))))
     return Case(dataclasses.replace(made, advice=advice_of(made)))
 
 

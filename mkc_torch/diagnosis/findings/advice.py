@@ -11,10 +11,12 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.unit_text import sized, tidy
-from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment, ProcessNoise
-from mkc_torch.diagnosis.findings.grading import change, transfers, worth_correcting
+from mkc_torch.diagnosis.environment import ProcessNoise
+from mkc_torch.diagnosis.held_out_gain import change
 from mkc_torch.diagnosis.result import Alternative, Diagnosis, Finding
 from mkc_torch.diagnosis.search.run import SearchResult
+from mkc_torch.diagnosis.verdict import conclusion, doubted_signs
+from mkc_torch.diagnosis.vetoes import transfers, worth_correcting
 from mkc_torch.effects import is_curve
 from mkc_torch.effects.kinds import MOTION
 
@@ -22,13 +24,8 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 
-_FLOOR = 2.0
-"""Residual, in noise floors, up to which an output that hardly varies counts as fitted."""
-
 _WARMING_UP = 60.0
 """Correlation time in s beyond which a drift may be the warming up of a sensor."""
-
-_USE = "The simulation can be used within the range of this recording."
 
 _SWITCHED = (
     "Look for a cause that is switched on and off, such as a heater, a lamp or a motor, and record it: the offset is "
@@ -63,57 +60,27 @@ _MOST = 20.0
 """Ratio of samples above which "far more samples" is reported."""
 
 
-def follows(fit: GoodnessOfFit) -> bool:
-    """Whether the residual of an output is smaller than that of its mean, or at the sensor's noise.
-
-    Example:
-        >>> still = GoodnessOfFit("angle", "rad", 0.0051, 0.005, -0.04, 0.005, "declared", 0.005, 0.007)
-        >>> lost = GoodnessOfFit("angle", "rad", 0.36, 0.35, -0.06, 0.005, "declared", 0.35, 0.02)
-        >>> follows(still), follows(lost)
-        (True, False)
-    """
-    return fit.residual < fit.rmse_of_mean or fit.residual <= _FLOOR * fit.noise_floor
-
-
-def follows_all(environment: NoiseEnvironment) -> bool:
-    """Whether :func:`follows` holds for each output."""
-    return all(follows(fit) for fit in environment.goodness_of_fit)
-
-
-def nothing_shows(diagnosis: Diagnosis) -> bool:
-    """Whether the simulation needs no correction: it fits, and the residual is the sensor's noise."""
-    d = diagnosis
-    quiet = bool(d.findings) or d.p_value is None or d.p_value > d.level
-    return d.verdict == "adequate" and quiet and not d.remaining and follows_all(d.environment)
-
-
 def advice_of(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return advice in sentences, the most important first, with effect ids."""
     d = diagnosis
-    if d.stop is not None:
-        return ("Complete the search: these results are incomplete.",)
-    if d.verdict == "unfit":
-        return _fix_first(d)
-    if d.quick and d.findings:
-        return ("Confirm it by a full diagnosis.",)  # a quick look tests no held-out blocks
-    return _after_the_search(d)
+    known = conclusion(d)
+    first = known.first_advice(quick=d.quick, reasons=bool(d.environment.reasons))
+    if known.verdict == "adequate":
+        return (first, *(_hold_back(f, d) for f in d.findings))
+    if known.check:
+        left = () if doubted_signs(d.decisions) else _of_what_remains(d)
+        return (first, *dict.fromkeys([*(sentence for f in d.findings for sentence in _of(f, d)), *left]))
+    return (first,) if first else _after_the_search(d)
 
 
 def _after_the_search(diagnosis: Diagnosis) -> tuple[str, ...]:
     d = diagnosis
-    if nothing_shows(d):
-        return (_USE, *(_hold_back(f, d) for f in d.findings))
     advice = [sentence for finding in d.findings for sentence in _of(finding, d)]
     advice += _of_what_remains(d)
     use = [_called(f, d) for f in d.findings if transfers(f)]
     if use:
         advice.append(f"The model found here corrects for {' and '.join(use)}: confirm it on a second recording.")
     return tuple(dict.fromkeys(advice))
-
-
-def _fix_first(diagnosis: Diagnosis) -> tuple[str, ...]:
-    known = "the reasons" if diagnosis.environment.reasons else "signs, units, delays and start values"
-    return (f"Do not rely on this simulation yet: check {known}, then diagnose again.",)
 
 
 def _of_what_remains(diagnosis: Diagnosis) -> Iterator[str]:

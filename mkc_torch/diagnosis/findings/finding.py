@@ -17,20 +17,19 @@ from mkc_torch.diagnosis.evidence.base import gain_of
 from mkc_torch.diagnosis.findings.advice import SAME, distinguishing_state
 from mkc_torch.diagnosis.findings.regions import attributed, map_of, region_of, shares_of_runs
 from mkc_torch.diagnosis.findings.shape import FINE_POINTS, drawn_points, formulas
+from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.shapes import reach_of
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import Alternative, EffectParameter, Finding, Number, Reference, Separability
 from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.diagnosis.search.run import SearchResult
+from mkc_torch.diagnosis.vetoes import FAR
 from mkc_torch.effects.context import Context
 from mkc_torch.effects.kinds import kind_at
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
-
-FAR = 10.0
-"""Multiple of the plausible size above which a finding is unconfirmed."""
 
 _AT_END = 0.01
 """Relative distance within which a number is at a bound."""
@@ -152,6 +151,8 @@ def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quic
         plausible=plausible and not cannot_be,
         plausibility=cannot_be or text,
         cannot_be=bool(cannot_be),
+        times_plausible=times_plausible(term, gamma, context),
+        shown_share=_shown_share(final.fit, number),
         doubts=shape_at_ends(term, final.fit.model.prepared, context),
         curve=curve,
         region=None if where is None else region_of(where),
@@ -186,6 +187,25 @@ def _own(final: FinalEstimate, number: int) -> tuple[Tensor, Tensor]:
     start = model.base + sum(model.sizes[:number])
     mine = slice(start, start + model.sizes[number])
     return final.fit.parameters[mine], final.covariance[mine, mine]
+
+
+def _shown_share(fit: FittedModel, number: int) -> float | None:
+    """Return the share of the change of a sensor's vector that its compared length shows.
+
+    None where each component of the vector is compared, and for an effect without a waveform.
+    """
+    model, term = fit.model, fit.model.terms[number]
+    port = model.prepared.ports[term.port]
+    if len(port.channels) <= fit.residual.shape[1] or not port.pointwise or not term.effect.has_waveform:
+        return None
+    start = model.base + sum(model.sizes[:number])
+    gone = fit.parameters.clone()
+    gone[start : start + model.sizes[number]] = 0.0
+    shown = model.residual(fit.parameters) - model.residual(gone)
+    context = term.context(model.prepared, model.signals(gone)[term.port])
+    moved = term.effect.change(fit.parameters[start : start + model.sizes[number]], term.shape, context)
+    size = float(moved.square().sum())
+    return math.sqrt(float(shown.square().sum()) / size) if size > 0.0 else None
 
 
 def _context(final: FinalEstimate, term: Term) -> Context:

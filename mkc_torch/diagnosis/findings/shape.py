@@ -183,12 +183,13 @@ def shape_of(fit: FittedModel, number: int, terms: Sequence[Term], settings: Evi
     )
     half, value = torch.tensor(0.5 * more).double(), torch.tensor(max(gain, 0.0)).double()
     chance = float(torch.special.gammaincc(half, value))
-    if chance >= settings.shape_level or gain <= settings.shape_nats + schwarz(best) * more:
-        return ShapeCheck(gain, chance)
+    needed = settings.shape_nats + schwarz(best) * more
+    if chance >= settings.shape_level or gain <= needed:
+        return ShapeCheck(gain, chance, needed=needed)
     if has_process_noise(fit) and not term.effect.plot_axis and not improves_open_loop(best, fit):
         return None
     curve = curve_of(best, number)
-    return ShapeCheck(gain, chance, curve, nearest_power(curve))
+    return ShapeCheck(gain, chance, curve, nearest_power(curve), needed)
 
 
 def _curves(term: Term, terms: Sequence[Term], fit: FittedModel) -> list[Term]:

@@ -13,8 +13,8 @@ from typing import Any
 
 from torch import Tensor
 
+from mkc_torch.diagnosis.decisions import Trail
 from mkc_torch.diagnosis.environment import DisturbanceEstimate, NoiseEnvironment, ProcessNoise, ShapeCheck
-from mkc_torch.diagnosis.findings.warnings import diagnosis_doubts
 from mkc_torch.diagnosis.result import (
     Diagnosis,
     EffectParameter,
@@ -25,6 +25,7 @@ from mkc_torch.diagnosis.result import (
     NoiseSummary,
     Number,
 )
+from mkc_torch.diagnosis.verdict import conclusion
 
 _MOST_POINTS = 500
 """Largest number of samples of a disturbance that are written."""
@@ -140,6 +141,32 @@ def remaining_json(diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
+def decisions_json(trail: Trail) -> dict[str, Any]:
+    """Return the scored models and the decisions, each in their order.
+
+    Example:
+        >>> from mkc_torch.diagnosis.decisions import ScoredModel
+        >>> decisions_json(Trail((ScoredModel((), "", 812.5, {"log_likelihood": 812.5}, "white", {}),)))["models"]
+        [{'terms': (), 'move': '', 'score': 812.5, 'parts': {'log_likelihood': 812.5}, ...}]
+    """
+    return {
+        "models": [
+            {
+                "terms": model.terms,
+                "move": model.move,
+                "score": _known(model.score),
+                "parts": {name: _known(value) for name, value in model.parts.items()},
+                "noise": model.noise,
+                "open_loop": {name: _known(value) for name, value in model.open_loop.items()},
+                "chosen": model.chosen,
+                "suspected": model.suspected,
+            }
+            for model in trail.models
+        ],
+        "decisions": [asdict(decision) | {"value": _known(decision.value)} for decision in trail.decisions],
+    }
+
+
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
@@ -172,7 +199,7 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "level": d.level,
         "p_value": d.p_value,
         "verdict": d.verdict,
-        "doubts": diagnosis_doubts(d),
+        "doubts": conclusion(d).doubts,
         "goodness_of_fit": goodness_of_fit_json(d.environment),
         "reasons": d.environment.reasons,
         **recordings_json(d.environment),
@@ -193,6 +220,7 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "ceiling": None,
         "advice": d.advice,
         "warnings": d.warnings,
+        "decisions": decisions_json(d.decisions),
         "notes": d.notes,
         "rejected_intervals": d.rejected_intervals,
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -11,17 +11,18 @@ import torch
 
 from mkc_torch._parallel.deadline import within
 from mkc_torch._support.note import notes_of, warnings_of
-from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment, Verdict
+from mkc_torch.diagnosis.decisions import Decision, ScoredModel, Trail
+from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment
 from mkc_torch.diagnosis.evidence.remaining import nameless
 from mkc_torch.diagnosis.evidence.run import EvidenceReport
 from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.findings.alternatives import with_parameters
 from mkc_torch.diagnosis.findings.finding import finding_of, separability
-from mkc_torch.diagnosis.findings.grading import grade_in_short, grade_of, is_zero_within_error, reasons_of, with_shape
 from mkc_torch.diagnosis.findings.noise import forcing_of, noise_summary, process_noise_of
+from mkc_torch.diagnosis.findings.reasons import reasons_of
 from mkc_torch.diagnosis.findings.shape import shape_of
 from mkc_torch.diagnosis.findings.warnings import evidence_warnings
-from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled, poor_fits
+from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit
 from mkc_torch.diagnosis.io.model import model_of
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, estimate_noise, refit_open_loop
@@ -34,42 +35,12 @@ from mkc_torch.diagnosis.pipeline.search_notes import significance
 from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Finding, Separability, Stop, Traces, notices
 from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.diagnosis.search.run import SearchResult
-from mkc_torch.diagnosis.settings import EvidenceSettings, NamingSettings, NoiseSettings
+from mkc_torch.diagnosis.settings import NamingSettings, NoiseSettings
+from mkc_torch.diagnosis.verdict import FitAssessment, Remainder, decisions_on_all, reservations_of, verdict_of
+from mkc_torch.diagnosis.vetoes import VetoContext, decisions_on, grade, is_dropped
 from mkc_torch.recording.unit_warnings import unit_warnings
-from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, sized_noise
+from mkc_torch.simulation.dynamics.noise import sized_noise
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
-
-_LOST = -1.0
-"""Smallest explained share of an output in the mean over the outputs."""
-
-
-@dataclass(frozen=True)
-class FitAssessment:
-    """Goodness of fit without and with the findings, and the remaining noise.
-
-    Attributes:
-        follows: goodness of fit of the simulation without findings, by output.
-        corrected: goodness of fit with the findings, by output.
-        noise: the remaining noise of differential equations; None for other simulations.
-        lost: True if no finding can make the fit good: the recorded rotations are wrong.
-    """
-
-    follows: tuple[GoodnessOfFit, ...]
-    corrected: tuple[GoodnessOfFit, ...]
-    noise: StateSpaceNoise | None
-    lost: bool = False
-
-    def unfit(self, settings: EvidenceSettings) -> bool:
-        """Whether the simulation explains too little of the variation, both without and with its findings.
-
-        An output that runs away counts against the others: an effect can tie one output to an input, and lose another.
-        """
-        if self.lost:
-            return True
-        if not poor_fits(self.follows, settings.followed):
-            return False
-        shares = [pooled(fits, _LOST) for fits in (self.follows, self.corrected) if fits]
-        return not shares or max(shares) < settings.useful
 
 
 def assess_baseline(base: ProcessNoiseFit, declared: Mapping[str, float]) -> tuple[GoodnessOfFit, ...]:
@@ -129,47 +100,8 @@ def noise_environment(
     )
 
 
-def verdict_of(
-    known: FitAssessment,
-    findings: Sequence[Finding],
-    *,
-    structure: bool,
-    white: bool,
-    settings: EvidenceSettings,
-) -> Verdict:
-    """Return the verdict.
-
-    Args:
-        known: the assessed fits.
-        findings: with their grades.
-        structure: whether there is structure beyond the findings: a significant candidate, or a smooth remainder.
-        white: whether the residual is white.
-        settings: thresholds.
-    """
-    if known.unfit(settings):
-        return "unfit"
-    disturbances = () if known.noise is None else known.noise.selected.disturbances
-    # with a finding, a sensor's own slow error counts as noise
-    disturbed_state = any(disturbance.at_rate or not findings for disturbance in disturbances)
-    above = [
-        fit
-        for fit in (known.corrected if findings else known.follows)
-        if fit.floor_source == "declared" and fit.residual > settings.above_floor * fit.noise_floor
-    ]
-    clean = white and not disturbed_state and not structure and not above
-    if not findings:
-        follows = not poor_fits(known.follows, settings.followed)
-        return "adequate" if clean and follows else "unexplained"
-    named = all(finding.grade in ("left_out", "small") for finding in findings)
-    return "explained" if named and clean else "unexplained"
-
-
 _MOMENT_S = 1.0
 """Time limit in seconds for each optional part of a stopped diagnosis."""
-
-
-_DROPPED = ("unconfirmed", "nearest")
-"""Grades of findings that are dropped if their size is 0 within its standard error."""
 
 
 @dataclass(frozen=True)
@@ -185,6 +117,7 @@ class DiagnosisInputs:
         options: of the search.
         cut: whether there was a further finding beyond the limit.
         stop: why the search was stopped before its end, and what was not done.
+        models: the models that the search scored, in their order.
     """
 
     simulation: Simulation
@@ -195,6 +128,7 @@ class DiagnosisInputs:
     options: SearchOptions
     cut: bool
     stop: Stop | None = None
+    models: tuple[ScoredModel, ...] = ()
 
     @property
     def in_short(self) -> bool:
@@ -213,9 +147,10 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
     first, final, settings = case.first, case.final, options.settings
     known = _assessment(whole)
     unfit = known.unfit(settings.evidence)
-    tried = [] if unfit else [_finding(case.found, number, final, whole, answers) for number in range(len(case.found))]
-    without_size = [finding for finding in tried if finding.grade in _DROPPED and is_zero_within_error(finding)]
-    findings = tuple(finding for finding in tried if finding not in without_size)
+    count = 0 if unfit else len(case.found)
+    graded = [_graded(case.found, number, final, whole, answers) for number in range(count)]
+    findings = tuple(finding for finding, decided in graded if not is_dropped(decided))
+    without_size = tuple(finding for finding, decided in graded if is_dropped(decided))
     diagnosis = Diagnosis(
         recording=prepared.recording.name,
         simulation=prepared.name,
@@ -252,40 +187,66 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
         quick=options.quick,
         stop=whole.stop,
     )
-    there = first is not None and first.p_value <= options.level and not findings
-    structure = there or bool(diagnosis.remaining) or whole.cut or nameless(final.fit)
-    # for differential equations the noise model includes the correlation already
-    white = known.noise is not None or _white(diagnosis)
-    verdict = verdict_of(known, findings, structure=structure, white=white, settings=settings.evidence)
-    if whole.stop is not None and verdict != "unfit":
-        verdict = "unexplained"  # the rest of the search might have found more
-    diagnosis = replace(diagnosis, verdict=verdict)
+    left = Remainder(
+        tuple(_structure(diagnosis, whole, first, final)),
+        # for differential equations the noise model includes the correlation already
+        0.0 if known.noise is not None else _lag(diagnosis),
+        whole.stop,
+    )
+    decided = (
+        *(decision for _, decisions in graded for decision in decisions),
+        *decisions_on_all(known, left, settings.evidence, findings=bool(findings), flexible=bool(findings)),
+        *reservations_of(diagnosis),
+    )
+    trail = Trail(whole.models, decided)
+    diagnosis = replace(diagnosis, verdict=verdict_of(trail), decisions=trail)
     return replace(diagnosis, advice=advice_of(diagnosis))
 
 
-def _finding(
-    found: Sequence[SearchResult], number: int, final: FinalEstimate, whole: DiagnosisInputs, answers: EvidenceReport
-) -> Finding:
-    """Return a finding with its evidence, shape check and grade; by its evidence alone if a test failed."""
-    quick = whole.options.quick
-    finding = replace(finding_of(found[number], final, number, quick=quick), evidence=answers.of_findings[number])
-    finding = replace(finding, clearly_better=_clearly_better(answers.case.fits, number, whole.options.settings.naming))
-    in_short = replace(finding, grade=grade_in_short(finding))
-    if whole.in_short or not any(result.test == "held_out" for result in finding.evidence):
-        return in_short
-    step = f"testing the shape of {finding.effect}, and its alternatives"
-    return optional(step, partial(_graded, finding, found, number, final, whole), lambda: in_short)
+def _structure(
+    diagnosis: Diagnosis, whole: DiagnosisInputs, first: SearchResult | None, final: FinalEstimate
+) -> Iterator[str]:
+    """Yield each kind of structure that the findings leave, in a sentence."""
+    d = diagnosis
+    if first is not None and first.p_value <= d.level and not d.findings:
+        yield f"The strongest candidate does not count as a finding: {significance(first.p_value)}."
+    if d.remaining:
+        yield f"A smooth trend along {', '.join(d.remaining)} remains."
+    if whole.cut:
+        yield "There is a further finding beyond the limit."
+    if nameless(final.fit):
+        yield "A finding is a curve without a name."
 
 
 def _graded(
+    found: Sequence[SearchResult], number: int, final: FinalEstimate, whole: DiagnosisInputs, answers: EvidenceReport
+) -> tuple[Finding, tuple[Decision, ...]]:
+    """Return a finding with its evidence, shape check and grade, and the decisions on it.
+
+    After an error in its tests the decisions are those of a diagnosis that is cut short.
+    """
+    quick, settings = whole.options.quick, whole.options.settings
+    finding = replace(finding_of(found[number], final, number, quick=quick), evidence=answers.of_findings[number])
+    finding = replace(finding, clearly_better=_clearly_better(answers.case.fits, number, settings.naming))
+    in_short = whole.in_short or not any(result.test == "held_out" for result in finding.evidence)
+    if not in_short:
+        step = f"testing the shape of {finding.effect}, and its alternatives"
+        tested = optional(step, partial(_with_shape, finding, found, number, final, whole), lambda: None)
+        finding, in_short = (finding, True) if tested is None else (tested, False)
+    decided = decisions_on(finding, VetoContext(whole.options.level, number + 1, in_short))
+    return replace(finding, grade=grade(decided)), decided
+
+
+def _with_shape(
     finding: Finding, found: Sequence[SearchResult], number: int, final: FinalEstimate, whole: DiagnosisInputs
 ) -> Finding:
-    """Return a finding with its shape check, the parameters of its alternatives, and its grade."""
-    others = with_parameters(finding.alternatives, found[number], final, number, whole.options.settings.noise)
+    """Return a finding with its shape check and the parameters of its alternatives."""
+    settings = whole.options.settings
+    others = with_parameters(finding.alternatives, found[number], final, number, settings.noise)
     shape = None
     if whole.final.model.prepared.dynamics is not None:
-        shape = shape_of(whole.final, number, whole.terms, whole.options.settings.evidence)
-    return replace(finding, grade=with_shape(grade_of(finding), shape), shape=shape, alternatives=others)
+        shape = shape_of(whole.final, number, whole.terms, settings.evidence)
+    return replace(finding, shape=shape, alternatives=others)
 
 
 def _clearly_better(fits: Sequence[FittedModel], number: int, naming: NamingSettings) -> bool:
@@ -340,10 +301,10 @@ def _no_size(finding: Finding) -> str:
     )
 
 
-def _white(diagnosis: Diagnosis) -> bool:
-    """Whether the residual is white."""
+def _lag(diagnosis: Diagnosis) -> float:
+    """Return the largest lag at which the residual is correlated; 0 for a white residual."""
     channels = next((result.value for result in diagnosis.evidence if result.test == "whiteness"), None)
-    return not channels or all(channel.lag == 0 for channel in channels.values())
+    return float(max((channel.lag for channel in channels.values()), default=0)) if channels else 0.0
 
 
 def _candidates(first: SearchResult | None) -> tuple[CandidateScore, ...]:

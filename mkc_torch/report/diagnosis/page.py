@@ -14,6 +14,7 @@ from mkc_torch._support.typesetting import several, typeset
 from mkc_torch.diagnosis.plot.drawings import CURVE_COLORS
 from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Separability
 from mkc_torch.report.diagnosis import (
+    decisions,
     environment,
     evidence,
     findings,
@@ -77,6 +78,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "", paths: verdict.Run
         paths=paths,
         say=findings,
         evidence=evidence,
+        decided=decisions,
         numbers=numbers,
         noise=noise,
         top=verdict,

@@ -6,14 +6,14 @@ import math
 
 from mkc_torch._support.typesetting import plain
 from mkc_torch.diagnosis.environment import NoiseEnvironment
-from mkc_torch.diagnosis.findings.grading import (
+from mkc_torch.diagnosis.held_out_gain import (
     SMALL,
     Confirmation,
     better_on_average,
     change,
     confirmation,
     mean_ratio,
-    vetoed,
+    rejects,
 )
 from mkc_torch.diagnosis.result import Diagnosis, HeldOut, ResidualSizes
 from mkc_torch.report.diagnosis.numbers import improvement
@@ -46,7 +46,7 @@ def better(held_out: HeldOut) -> str:
 
 def _freely(held_out: HeldOut, kind: Confirmation) -> tuple[str, str]:
     """Return key and reason if the open-loop residual decides."""
-    if vetoed(held_out):
+    if rejects(held_out):
         if kind in ("surely", "probably"):
             return _BETTER[
                 "not shown"

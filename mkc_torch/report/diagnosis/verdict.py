@@ -6,13 +6,12 @@ import math
 import re
 import shlex
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from mkc_torch._support.typesetting import capital, plain, several
-from mkc_torch.diagnosis.findings.advice import follows_all, nothing_shows
-from mkc_torch.diagnosis.findings.grading import small, transfers, worth_correcting
-from mkc_torch.diagnosis.findings.warnings import diagnosis_doubts, rejected_share
 from mkc_torch.diagnosis.result import UNFINISHED, VERDICT_SENTENCES, Diagnosis, Finding, notices
+from mkc_torch.diagnosis.verdict import Status, conclusion, doubted_signs, rejected_share
+from mkc_torch.diagnosis.vetoes import is_small, transfers, worth_correcting
 from mkc_torch.report.diagnosis.findings import NOT_TESTED, finding_name, inseparable, rivals, unrecorded, with_names
 from mkc_torch.report.diagnosis.unseen import residual_of_all
 from mkc_torch.report.words.numbers import share, size
@@ -36,22 +35,9 @@ class RunPaths(NamedTuple):
     options: tuple[str, ...]
 
 
-Tone = Literal["good", "found", "faint", "open"]
-"""Style of a headline: nothing missing; named physics missing; nothing worth correcting; poor fit, unnamed
-structure, or another doubt.
-"""
-
-
-def tone(diagnosis: Diagnosis) -> Tone:
-    """Return the style of the headline."""
-    d = diagnosis
-    if d.verdict in ("unfit", "unexplained") or {"not_better", "much_rejected"} & set(diagnosis_doubts(d)):
-        return "open"
-    if any(worth_correcting(f) for f in d.findings):
-        return "found"
-    if d.verdict == "adequate":
-        return "good" if nothing_shows(d) else "open"
-    return "faint" if d.findings else "open"
+def status(diagnosis: Diagnosis) -> Status:
+    """Return the status of the headline."""
+    return conclusion(diagnosis).status
 
 
 def headline(diagnosis: Diagnosis) -> str:
@@ -62,7 +48,7 @@ def headline(diagnosis: Diagnosis) -> str:
 
 def _doubtful(diagnosis: Diagnosis) -> str:
     """Return the reasons for doubt that the verdict does not state; empty if there are none."""
-    found = diagnosis_doubts(diagnosis)
+    found = conclusion(diagnosis).doubts
     reasons = []
     if "not_better" in found:
         sizes = "; ".join(residual_of_all(diagnosis))
@@ -74,9 +60,9 @@ def _doubtful(diagnosis: Diagnosis) -> str:
 
 def _verdict(diagnosis: Diagnosis) -> str:
     d = diagnosis
-    if d.verdict == "unfit" or (d.verdict == "adequate" and not follows_all(d.environment)):
+    if d.verdict == "unfit":
         return VERDICT_SENTENCES["unfit"]
-    if nothing_shows(d):
+    if d.verdict == "adequate":
         real = [f for f in d.findings if f.grade != "unconfirmed"]
         return f"No missing physics is worth correcting. {_found(real)}" if real else VERDICT_SENTENCES["adequate"]
     sentences = [_found(d.findings), unexplained(d)]
@@ -112,7 +98,7 @@ def _kind(finding: Finding) -> str:
     if finding.grade == "unconfirmed" and finding.held_out is None:
         return _NOT_TESTED
     if finding.grade == "unconfirmed":
-        return _BOTH if small(finding) else _UNCONFIRMED
+        return _BOTH if is_small(finding) else _UNCONFIRMED
     return {"left_out": _LEFT_OUT, "small": _SMALL}.get(finding.grade, _NEAREST)
 
 
@@ -135,6 +121,9 @@ def unexplained(diagnosis: Diagnosis) -> str:
     d = diagnosis
     if d.stop is not None:
         return UNFINISHED
+    signs = doubted_signs(d.decisions)
+    if signs:
+        return signs
     found = any(worth_correcting(f) for f in d.findings)
     if d.verdict == "unexplained" and d.environment.process_noise:
         rates, places = _driven(d)
@@ -156,11 +145,6 @@ def unexplained(diagnosis: Diagnosis) -> str:
             if found
             else "The residual has a smooth trend along {columns} that no effect in the catalogue explains."
         ).format(columns=several(d.remaining))
-    passed = d.p_value is not None and d.p_value <= d.level
-    if not d.findings and passed and d.verdict == "adequate":
-        return (
-            "The strongest candidate is significant, but no effect also predicts held-out blocks: no physics is named."
-        )
     if d.verdict != "unexplained":
         return ""
     if any(unrecorded(f) for f in d.findings):
@@ -185,6 +169,8 @@ def unexplained_place(diagnosis: Diagnosis) -> str:
         return "the intervals of rejected samples" if d.rejected_intervals else ""
     if d.stop is not None:
         return "unknown; the search was stopped"
+    if doubted_signs(d.decisions):
+        return "unknown; check signs and units first"
     if d.verdict == "unexplained" and d.environment.process_noise:
         rates, places = _driven(d)
         return f"the rate of {several(places)}" if rates else several(places)

@@ -54,7 +54,7 @@ def test_keys_are_those_of_the_format(content):
         "reasons",
         "noise",
         "search", "findings", "disturbance", "remaining", "baseline", "corrected", "ceiling", "advice", "warnings",
-        "notes", "rejected_intervals",
+        "notes", "rejected_intervals", "decisions",
     }  # fmt: skip
     assert set(content["search"]) == {"candidates", "surrogates", "seed", "starts", "quick", "stopped"}
     assert set(content["findings"][0]) == {

@@ -99,7 +99,7 @@ def test_advice_on_an_unfit_simulation_is_to_correct_it_first():
 
 def test_a_poor_fit_never_advises_using_the_simulation():
     lost = make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=POOR_FITS, process_noise=()))
-    assert lost.verdict == "adequate"
+    assert lost.verdict == "unfit"
     assert "Use the simulation as it is" not in " ".join(lost.advice)
     followed = make_diagnosis(0, samples=50, environment=make_environment(process_noise=()))
     (advice,) = followed.advice

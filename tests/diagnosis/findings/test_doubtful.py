@@ -6,30 +6,30 @@ import json
 import pytest
 
 from mkc_torch.diagnosis.findings.advice import advice_of
-from mkc_torch.diagnosis.findings.warnings import diagnosis_doubts, rejected_share
 from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
-from mkc_torch.report.diagnosis.verdict import headline, tone
+from mkc_torch.diagnosis.verdict import conclusion, rejected_share
+from mkc_torch.report.diagnosis.verdict import headline, status
 from tests.diagnosis.factory import make_diagnosis
 
 
 def test_a_confirmed_result_has_no_doubts():
     for findings in (0, 1, 2):
         found = make_diagnosis(findings)
-        assert diagnosis_doubts(found) == ()
+        assert conclusion(found).doubts == ()
         assert "Doubtful" not in headline(found)
 
 
 @pytest.mark.parametrize(("verdict", "doubt"), [("unfit", "unfit"), ("unexplained", "unexplained")])
 def test_the_verdicts_unfit_and_unexplained_are_doubts(verdict, doubt):
-    assert diagnosis_doubts(make_diagnosis(0, verdict=verdict)) == (doubt,)
+    assert conclusion(make_diagnosis(0, verdict=verdict)).doubts == (doubt,)
 
 
 def test_findings_that_do_not_reduce_the_residual_are_a_doubt_in_the_headline():
     found = make_diagnosis(1)
     worse = dataclasses.replace(found, corrected=dataclasses.replace(found.corrected, rmse=1.2 * found.baseline.rmse))
-    assert diagnosis_doubts(worse) == ("not_better",)
+    assert conclusion(worse).doubts == ("not_better",)
     assert headline(worse).startswith("Doubtful: the findings do not make the residual smaller (")
-    assert tone(worse) == "open"
+    assert status(worse) == "open"
     assert json.loads(diagnosis_to_json(worse))["doubts"] == ["not_better"]
 
 
@@ -39,7 +39,7 @@ def test_a_third_of_rejected_samples_is_a_doubt_in_the_headline():
     weight[: int(0.4 * len(weight))] = 0.1
     much = dataclasses.replace(found, traces=dataclasses.replace(found.traces, weight=weight))
     assert rejected_share(much) >= 0.4
-    assert diagnosis_doubts(much) == ("much_rejected",)
+    assert conclusion(much).doubts == ("much_rejected",)
     assert headline(much).startswith("Doubtful: 4")
     assert "of the samples were rejected." in headline(much)
 
@@ -47,7 +47,7 @@ def test_a_third_of_rejected_samples_is_a_doubt_in_the_headline():
 def test_unconfirmed_findings_alone_are_a_doubt():
     found = make_diagnosis(1)
     unconfirmed = dataclasses.replace(found, findings=(dataclasses.replace(found.findings[0], grade="unconfirmed"),))
-    assert "unconfirmed" in diagnosis_doubts(unconfirmed)
+    assert "unconfirmed" in conclusion(unconfirmed).doubts
 
 
 def test_the_headline_of_a_quick_look_names_the_skipped_tests():
@@ -58,4 +58,4 @@ def test_the_headline_of_a_quick_look_names_the_skipped_tests():
     assert "no effect in the catalogue" not in headline(quick)
     (advice,) = advice_of(quick)
     assert "full diagnosis" in advice
-    assert {"unexplained", "unconfirmed"} <= set(diagnosis_doubts(quick))
+    assert {"unexplained", "unconfirmed"} <= set(conclusion(quick).doubts)

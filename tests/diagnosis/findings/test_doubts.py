@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 import torch
 
+from mkc_torch.diagnosis import vetoes
 from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.findings.finding import far_from_plausible, shape_at_ends, times_plausible
-from mkc_torch.diagnosis.findings.grading import grade_of
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.effects.dynamics.hidden_lag import HiddenLag
@@ -84,7 +84,7 @@ def test_an_impossible_size_is_unconfirmed_with_its_reason():
     made = make_diagnosis(1, samples=50)
     why = "Its share ended at 30, the upper bound: the recording does not limit it."
     odd = dataclasses.replace(made.findings[0], cannot_be=True, plausible=False, plausibility=why, alternatives=())
-    odd = dataclasses.replace(odd, grade=grade_of(odd))
+    odd = dataclasses.replace(odd, grade=vetoes.grade(vetoes.decisions_on(odd)))
     assert (made.findings[0].grade, odd.grade) == ("left_out", "unconfirmed")
     diagnosis = dataclasses.replace(made, findings=(odd,))
     assert grade(odd) == "not confirmed: impossible size"

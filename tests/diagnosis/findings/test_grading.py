@@ -6,10 +6,15 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.environment import ShapeCheck
-from mkc_torch.diagnosis.findings.grading import grade_in_short, grade_of, is_zero_within_error, with_shape
 from mkc_torch.diagnosis.result import EffectParameter, EvidenceResult, Finding, HeldOut
+from mkc_torch.diagnosis.vetoes import VETOES, VetoContext, decisions_on, grade, is_dropped, is_zero_within_error
 
+IN_SHORT = VetoContext(in_short=True)
 SURE = (EvidenceResult("held_out", (HeldOut(0.3, (0.2, 0.4), 2.0, 1.0, "µT"), "")),)
+
+
+def grade_of(found, context=VetoContext()):  # noqa: B008 - frozen
+    return grade(decisions_on(found, context))
 
 
 def finding(*numbers):
@@ -65,11 +70,11 @@ def finding_of_rmse_after(after, **known):
     return (EvidenceResult("held_out", (HeldOut(0.3, (0.2, 0.4), 1.0, after, "rad", **known), "")),)
 
 
-@pytest.mark.parametrize(("after", "grade"), [(0.9, "left_out"), (0.96, "unconfirmed"), (4.7, "unconfirmed")])
-def test_a_size_of_zero_within_its_error_is_confirmed_only_by_a_smaller_held_out_residual(after, grade):
+@pytest.mark.parametrize(("after", "expected"), [(0.9, "left_out"), (0.96, "unconfirmed"), (4.7, "unconfirmed")])
+def test_a_size_of_zero_within_its_error_is_confirmed_only_by_a_smaller_held_out_residual(after, expected):
     """The likelihood with the residual's correlation can rise for a residual that grows slowly, or is the same."""
     found = dataclasses.replace(finding((1.3, 5.5), (0.04, None)), clearly_better=True)
-    assert grade_of(dataclasses.replace(found, evidence=finding_of_rmse_after(after))) == grade
+    assert grade_of(dataclasses.replace(found, evidence=finding_of_rmse_after(after))) == expected
 
 
 def test_under_process_noise_a_finding_without_an_open_loop_gain_is_unconfirmed():
@@ -85,20 +90,58 @@ def test_under_process_noise_a_finding_without_an_open_loop_gain_is_unconfirmed(
     assert grade_of(dataclasses.replace(unsure, clearly_better=True)) == "small"
 
 
-@pytest.mark.parametrize(
-    ("before", "after"), [("left_out", "nearest"), ("small", "nearest"), ("unconfirmed", "unconfirmed")]
-)
-def test_a_finding_of_another_shape_is_nearest_or_unconfirmed(before, after):
-    curve = object()
-    assert with_shape(before, ShapeCheck(40.0, 0.002, curve)) == after
-    assert with_shape(before, ShapeCheck(0.5, 0.4)) == with_shape(before, None) == before
+@pytest.mark.parametrize(("rmse", "after"), [(1.0, "nearest"), (1.92, "nearest"), (2.0, "unconfirmed")])
+def test_a_finding_of_another_shape_is_nearest_or_unconfirmed(rmse, after):
+    held = HeldOut(0.3, (0.2, 0.4) if rmse < 2.0 else (-0.1, 0.7), 2.0, rmse, "µT")
+    found = dataclasses.replace(finding((0.3, 0.1)), evidence=(EvidenceResult("held_out", (held, "")),))
+    before = grade_of(found)
+    assert before == {1.0: "left_out", 1.92: "small", 2.0: "unconfirmed"}[rmse]
+    assert grade_of(dataclasses.replace(found, shape=ShapeCheck(40.0, 0.002, object(), needed=12.0))) == after
+    assert grade_of(dataclasses.replace(found, shape=ShapeCheck(0.5, 0.4))) == before
 
 
 @pytest.mark.parametrize(
-    ("gain", "after", "grade"), [(0.1, 0.9, "left_out"), (0.1, 0.97, "unconfirmed"), (-0.01, 0.9, "unconfirmed")]
+    ("gain", "after", "expected"), [(0.1, 0.9, "left_out"), (0.1, 0.97, "unconfirmed"), (-0.01, 0.9, "unconfirmed")]
 )
-def test_held_out_likelihood_and_residual_confirm_a_finding_whose_gain_interval_includes_zero(gain, after, grade):
+def test_held_out_likelihood_and_residual_confirm_a_finding_whose_gain_interval_includes_zero(gain, after, expected):
     held = HeldOut(gain, (-0.2, 0.3), 1.0, after, "rad")
     found = dataclasses.replace(finding((1.3, 0.1)), evidence=(EvidenceResult("held_out", (held, "")),))
-    assert grade_of(found) == grade
-    assert grade_in_short(found) == "unconfirmed"  # without surrogates it may be chance
+    assert grade_of(found) == expected
+    assert grade_of(found, IN_SHORT) == "unconfirmed"  # without surrogates it may be chance
+
+
+@pytest.mark.parametrize(
+    ("changes", "rule", "expected"),
+    [
+        ({"p_value": 0.2}, "p_value", "unconfirmed"),
+        ({"cannot_be": True, "times_plausible": 12.0}, "size_plausible", "unconfirmed"),
+        ({"shown_share": 0.04}, "visible", "unconfirmed"),
+        ({"shape": ShapeCheck(40.0, 0.002, object(), needed=12.0)}, "shape", "nearest"),
+    ],
+)
+def test_a_single_failed_veto_lowers_the_grade(changes, rule, expected):
+    found = dataclasses.replace(finding((0.3, 0.1)), **changes)
+    decisions = decisions_on(found)
+    assert [decision.rule for decision in decisions if not decision.passed] == [rule]
+    assert grade(decisions) == grade(decisions[::-1]) == expected
+    assert not is_dropped(decisions)
+
+
+def test_decisions_are_in_the_order_of_the_vetoes_and_name_the_finding():
+    found = dataclasses.replace(finding((0.3, 0.1)), channels=("rate of speed",), times_plausible=0.3, shown_share=0.5)
+    decisions = decisions_on(found, VetoContext(number=2))
+    order = [veto.__name__ for veto in VETOES]
+    assert [order.index(decision.rule) for decision in decisions] == sorted(
+        order.index(decision.rule) for decision in decisions
+    )
+    assert {(decision.subject, decision.finding) for decision in decisions} == {("coupling@speed", 2)}
+    assert all(decision.sentence.endswith(".") for decision in decisions)
+
+
+def test_a_quick_look_confirms_by_sure_held_out_blocks_only():
+    sure = dataclasses.replace(finding((0.3, 0.1)), p_value=None)
+    assert grade_of(sure, IN_SHORT) == "left_out"
+    assert grade_of(dataclasses.replace(sure, evidence=()), IN_SHORT) == "unconfirmed"
+    assert grade_of(dataclasses.replace(sure, evidence=())) == "left_out"
+    freely = dataclasses.replace(sure, evidence=finding_of_rmse_after(0.5, decides=False))
+    assert (grade_of(freely, IN_SHORT), grade_of(freely)) == ("unconfirmed", "left_out")

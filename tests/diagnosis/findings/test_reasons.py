@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from mkc_torch.diagnosis.findings import grading as reasons
-from mkc_torch.diagnosis.findings.grading import at_ends, reasons_of
+from mkc_torch.diagnosis.findings import reasons
+from mkc_torch.diagnosis.findings.reasons import at_ends, reasons_of
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel

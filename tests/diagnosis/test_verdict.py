@@ -1,13 +1,13 @@
 """The verdict, from assessments made by hand."""
 
 import itertools
-from types import SimpleNamespace
 
 import pytest
 import torch
 
-from mkc_torch.diagnosis.pipeline.build import FitAssessment, verdict_of
+from mkc_torch.diagnosis.decisions import Decision, Trail
 from mkc_torch.diagnosis.settings import EvidenceSettings
+from mkc_torch.diagnosis.verdict import FitAssessment, Remainder, decisions_on_all, grades_of, verdict_of
 from mkc_torch.simulation.dynamics.noise import StateSpaceNoise
 from mkc_torch.simulation.dynamics.noise_selection import SelectedNoise
 from mkc_torch.simulation.dynamics.observer import Disturbance
@@ -15,7 +15,8 @@ from tests.diagnosis.factory import make_goodness_of_fit
 
 GOOD_FIT, POOR_FIT = make_goodness_of_fit(), make_goodness_of_fit(residual=0.33, explained=0.1)
 HALFWAY = make_goodness_of_fit(residual=0.15, explained=0.8, floor=0.14)
-FIRST, SMALL = SimpleNamespace(grade="left_out"), SimpleNamespace(grade="small")
+FAILED = {"left_out": (), "small": ("residual_reduction",), "nearest": ("shape",), "unconfirmed": ("open_loop",)}
+FIRST, SMALL = "left_out", "small"
 
 
 def noise(*disturbances):
@@ -29,8 +30,27 @@ def assessed(*follows, corrected=(), noise=None):
     return FitAssessment(follows, corrected, noise)
 
 
-def verdict(known, *findings, structure=False, white=True, **settings):
-    return verdict_of(known, findings, structure=structure, white=white, settings=EvidenceSettings(**settings))
+def decisions_of(grades):
+    """Return decisions on findings of these grades."""
+    rules = [("p_value", *FAILED[grade]) for grade in grades]
+    return [
+        Decision(rule, "drag@speed", 1.0, 0.5, rule == "p_value", "", number)
+        for number, each in enumerate(rules, start=1)
+        for rule in each
+    ]
+
+
+def trail_of(known, *grades, structure=False, white=True, flexible=False, **settings):
+    left = Remainder(("A trend remains.",) if structure else (), 0.0 if white else 3.0)
+    limits = EvidenceSettings(**settings)
+    on_all = decisions_on_all(known, left, limits, findings=bool(grades), flexible=flexible)
+    trail = Trail(decisions=(*decisions_of(grades), *on_all))
+    assert known.unfit(limits) or grades_of(trail) == grades
+    return trail
+
+
+def verdict(known, *grades, **changes):
+    return verdict_of(trail_of(known, *grades, **changes))
 
 
 @pytest.mark.parametrize("known", [assessed(GOOD_FIT), assessed(GOOD_FIT, noise=noise()), assessed()])
@@ -74,8 +94,7 @@ def test_named_findings_with_white_residual_explain(findings):
 
 @pytest.mark.parametrize("grade", ["unconfirmed", "nearest"])
 def test_a_finding_without_a_confirmed_name_is_unexplained(grade):
-    doubted = SimpleNamespace(grade=grade)
-    for findings in ((doubted,), (FIRST, doubted)):
+    for findings in ((grade,), (FIRST, grade)):
         assert verdict(assessed(GOOD_FIT, corrected=(GOOD_FIT,)), *findings) == "unexplained"
 
 
