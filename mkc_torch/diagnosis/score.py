@@ -11,7 +11,7 @@ any size can follow a recording one sample ahead; further ahead it has to pay wi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -203,6 +203,13 @@ def score(fit: FittedModel, basis: ScoreBasis, settings: Settings, near: Sequenc
         noise,
         per_sample(flow, noise, basis.horizons, basis.span),
     )
+
+
+def highest(fits: Iterable[FittedModel | None], basis: ScoreBasis, settings: Settings) -> float:
+    """Return the highest score of several fits of one model in nats; minus infinity if all lose the recording."""
+    unique = {id(fit): fit for fit in fits if fit is not None}
+    scores = [score(fit, basis, settings) for fit in unique.values()]
+    return max((found.value for found in scores if found is not None), default=-math.inf)
 
 
 def _noise_numbers(noise: NoiseModel) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -15,11 +15,8 @@ from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import (
     ProcessNoiseFit,
     first_samples,
-    fit_with_process_noise,
     has_process_noise,
-    refit_input_hold,
 )
-from mkc_torch.diagnosis.model.shapes import with_profiled_shape
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
@@ -150,13 +147,13 @@ def _tested(
     for number, step in enumerate(chain):
         previous = search.found[-1].fit if search.found else base.fit
         try:
-            located = search.first if number == 0 else _screened(previous, _left(step, chain, beam), options, generator)
+            located = search.first if number == 0 else _screened(previous, _left(previous, beam), options, generator)
             assert located is not None
             if located.p_value > options.level:
                 break
-            fit = _final(step.fit, options, last=number == len(chain) - 1)
-            located = _as_result(located, fit, step, beam)
-            after = _evidence(search, fit, options)
+            step = _final(step, beam, options, last=number == len(chain) - 1)
+            located = _as_result(located, step, beam)
+            after = _evidence(search, step.fit, options)
         except NoFitError as error:
             return replace(search, left=(), given_up=str(error))
         if number == 0 and options.judged and _refused(search.evidence[0], after, search, options):
@@ -169,9 +166,9 @@ def _tested(
     return replace(search, left=())
 
 
-def _left(step: Candidate, chain: Sequence[Candidate], beam: BeamSearch) -> tuple[Term, ...]:
-    """Return the candidates that the model before a step lacks."""
-    before = {term.key for term in chain[chain.index(step) - 1].fit.model.terms}
+def _left(fit: FittedModel, beam: BeamSearch) -> tuple[Term, ...]:
+    """Return the candidates that a model lacks."""
+    before = {term.key for term in fit.model.terms}
     return tuple(term for term in beam.terms if term.key not in before)
 
 
@@ -195,18 +192,17 @@ def _missing(model: Candidate, smaller: Candidate) -> list[Term]:
     return [term for term in model.fit.model.terms if term.key not in known]
 
 
-def _final(fit: FittedModel, options: SearchOptions, *, last: bool) -> FittedModel:
-    """Return a fit at its most likely shape under its remaining noise, and of the last also with the inputs' holds."""
-    fit = fit if options.quick else with_profiled_shape(fit)
-    if not has_process_noise(fit):
-        fit = fit_with_process_noise(fit, options.declared, options.settings.noise).fit
-    if last and not options.quick:
-        fit = refit_input_hold(fit, options.declared, options.fixed, options.settings.noise)
-    return fit
+def _final(step: Candidate, beam: BeamSearch, options: SearchOptions, *, last: bool) -> Candidate:
+    """Return a model at its best shape, noise and, of the last, holds of the inputs, each by its score."""
+    if options.quick:
+        return step
+    step = beam.under_noise(beam.profiled(step))
+    return beam.with_best_hold(step, options.fixed) if last else step
 
 
-def _as_result(located: SearchResult, fit: FittedModel, step: Candidate, beam: BeamSearch) -> SearchResult:
+def _as_result(located: SearchResult, step: Candidate, beam: BeamSearch) -> SearchResult:
     """Return the search result with the chosen effect first, and its rivals by their scores."""
+    fit = step.fit
     own = fit.model.terms[-1]
     terms = located.scene.terms
     others = {term.key for term in fit.model.terms[:-1]}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -15,9 +16,10 @@ from mkc_torch.diagnosis.model.process_noise import (
 from mkc_torch.diagnosis.pipeline.build import impossible_rotations
 from mkc_torch.diagnosis.pipeline.model_search import search_models
 from mkc_torch.diagnosis.pipeline.partial import PartialResult
-from mkc_torch.diagnosis.pipeline.prepare import Problem
+from mkc_torch.diagnosis.pipeline.prepare import Problem, SearchOptions
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.pipeline.stepwise import first_step, next_step
+from mkc_torch.diagnosis.score import basis_of, highest
 from mkc_torch.diagnosis.search.estimate import with_smaller_step
 from mkc_torch.simulation.protocol import PreparedSimulation
 
@@ -82,13 +84,21 @@ def fit_baseline(problem: Problem, known: PartialResult, prepared: PreparedSimul
         known.restart()
         problem.progress("fitting the simulation alone")
         baseline = fit_alone(prepared, declared, noise, known.keep_baseline)
-        baseline = choose_input_hold(baseline, declared, options.fixed, noise)
+        baseline = choose_input_hold(baseline, declared, options.fixed, noise, _score_of(baseline, options))
         known.keep_baseline(baseline, with_noise=True)
         _refuse_no_noise(baseline.fit, problem.where)
         finer = with_smaller_step(baseline.fit, noise)
         if finer is None:
             return baseline
         prepared = finer
+
+
+def _score_of(baseline: ProcessNoiseFit, options: SearchOptions) -> Callable[[ProcessNoiseFit], float]:
+    """Return the score of fits that differ in the inputs' holds."""
+    if not baseline.fit.model.prepared.input_hold:
+        return lambda _: 0.0
+    basis = basis_of(baseline.fit, 1, options.declared, options.settings)
+    return lambda fits: highest((fits.free, fits.fit), basis, options.settings)
 
 
 def _refuse_no_noise(base: FittedModel, where: str) -> None:

@@ -11,8 +11,8 @@ import torch
 
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted, fitted_with_effect, without_term
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise
-from mkc_torch.diagnosis.model.shapes import shape_fitted, with_form_of_grid
+from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise, has_process_noise
+from mkc_torch.diagnosis.model.shapes import shape_fitted, with_form_of_grid, with_profiled_shape
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
 from mkc_torch.diagnosis.score import Score, ScoreBasis, score
 from mkc_torch.diagnosis.search.moves import (
@@ -258,15 +258,41 @@ class BeamSearch:
     def _under_noise(self) -> None:
         """Fit the leading models under their process noise too; keep the fit that scores higher."""
         leading = sorted(self.models.values(), key=lambda model: -model.value)[:_NOISY]
-        works = [partial(self._with_noise, model) for model in leading]
+        works = [partial(self.under_noise, model) for model in leading]
         self._keep(run_parallel(works, leading[0].fit.model.prepared, self.terms, "model"))
 
-    def _with_noise(self, model: Candidate) -> Candidate:
+    def under_noise(self, model: Candidate) -> Candidate:
+        """Return a model fitted under its process noise if that scores higher, else the model."""
+        if has_process_noise(model.fit):
+            return model
         try:
             noisy = fit_with_process_noise(model.fit, self.declared, self.settings.noise).fit
         except NoFitError:
             return model
-        other = replace(model, fit=noisy, score=score(noisy, self.basis, self.settings))
+        return self._better(model, noisy)
+
+    def with_best_hold(self, model: Candidate, fixed: Mapping[str, str]) -> Candidate:
+        """Return a model with the hold of each input that scores highest; without the effects another may have.
+
+        Args:
+            model: the model.
+            fixed: inputs whose hold is known.
+        """
+        for name, how in model.fit.model.prepared.input_hold.items():
+            for other in ("held", "linear"):
+                if name not in fixed and other != how:
+                    held = _held(model.fit, name, other)
+                    model = model if held is None else self._better(model, held)
+        return model
+
+    def profiled(self, model: Candidate) -> Candidate:
+        """Return a model with the delay or lag of its last effect on an input at the maximum of its profile."""
+        return self._better(model, with_profiled_shape(model.fit))
+
+    def _better(self, model: Candidate, fit: FittedModel) -> Candidate:
+        if fit is model.fit:
+            return model
+        other = replace(model, fit=fit, score=score(fit, self.basis, self.settings))
         return other if other.value > model.value else model
 
 
@@ -341,6 +367,15 @@ def _exchanged(fit: FittedModel, number: int, group: Sequence[Term]) -> FittedMo
 def _refitted(start: FittedModel, like: FittedModel) -> FittedModel | None:
     try:
         return fitted(start.model, start.parameters, like.bound, graduate=False)
+    except NoFitError:
+        return None
+
+
+def _held(fit: FittedModel, name: str, how: str) -> FittedModel | None:
+    """Return the fit with another hold of an input; its trajectory is searched anew if the fit's own is too far."""
+    moved = JointModel(fit.model.prepared.with_input_hold({name: how}), fit.model.terms, fit.model.near)
+    try:
+        return shape_fitted(fitted(moved, fit.parameters, fit.bound, fresh=True))
     except NoFitError:
         return None
 
