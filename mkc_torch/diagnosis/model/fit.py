@@ -34,6 +34,12 @@ _DOMAIN_SCALES = 2.5
 _NARROWER = 2
 """Restarts of a fit with such a scale from its own end."""
 
+_ROUGH_STEPS = 12
+"""Steps of a rough fit."""
+
+_ROUGH_TOLERANCE = 1e-4
+"""Gain in nats per sample below which a rough fit ends."""
+
 _SHARES = (1.0, 0.3, 0.1, 0.01, 0.0)
 """Shares of an effect's initial size to try in turn if the simulation has no finite result."""
 
@@ -100,6 +106,7 @@ def fitted(
     rows: Float[Tensor, " N"] | None = None,
     graduate: bool = True,
     fresh: bool = False,
+    rough: bool = False,
 ) -> FittedModel:
     """Fit a joint model by maximum likelihood.
 
@@ -111,12 +118,13 @@ def fitted(
         graduate: False for a start near the solution.
         fresh: True to also search for a trajectory without the model's own as the start, if there is none near that:
             it may belong to another noise model. This is slow.
+        rough: True for a few steps only, to compare starts.
 
     Raises:
         NoFitError: the simulation has no finite result at the start or at the end of the fit.
     """
-    found = _fit(*_finite_start(model, start, fresh=fresh), bound, rows, graduate=graduate)
-    for _ in range(_NARROWER):
+    found = _fit(*_finite_start(model, start, fresh=fresh), bound, rows, graduate=graduate, rough=rough)
+    for _ in range(0 if rough else _NARROWER):
         seen = found.residual if rows is None else found.residual[rows > 0]
         if not bool((found.d > _WIDE * robust_scale(seen)).any()):
             break
@@ -135,6 +143,7 @@ def _fit(
     rows: Float[Tensor, " N"] | None,
     *,
     graduate: bool,
+    rough: bool = False,
 ) -> FittedModel:
     way = model.continuation()
     found = nonlinear.fit(
@@ -147,8 +156,8 @@ def _fit(
         upper=None if model.bounds is None else model.bounds[1],
         graduate=graduate,
         covariance=None,
-        max_iter=60,
-        tol=1e-7,
+        max_iter=_ROUGH_STEPS if rough else 60,
+        tol=_ROUGH_TOLERANCE if rough else 1e-7,
         jacobian=model.prepared.jacobian,
     )
     there = model.begun_with(way.near(found.theta))
@@ -169,11 +178,11 @@ def _fit(
 
 
 def fitted_with_effect(
-    base: FittedModel, model: JointModel, start: Float[Tensor, " p"], *, graduate: bool = True
+    base: FittedModel, model: JointModel, start: Float[Tensor, " p"], *, graduate: bool = True, rough: bool = False
 ) -> FittedModel:
     """Fit a model with one more effect on the domain of a fit without it; return the latter if this fails."""
     try:
-        return fitted(model, start, base.bound, graduate=graduate)
+        return fitted(model, start, base.bound, graduate=graduate, rough=rough)
     except nonlinear.NoFitError:
         none = base.parameters.new_zeros(model.size - base.model.size)
         return replace(base, model=model, parameters=torch.cat([base.parameters, none]))

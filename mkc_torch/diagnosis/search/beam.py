@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.model.shapes import shape_fitted, with_form_of_grid, wi
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
 from mkc_torch.diagnosis.score import Score, ScoreBasis, score
 from mkc_torch.diagnosis.search.moves import (
+    STARTS,
     Addition,
     additions,
     in_other_orders,
@@ -46,6 +47,9 @@ held-out blocks reject a finding."""
 
 _PAYS = 0.5
 """Share of its price that an addition to a model with effects has to gain in the linearised model."""
+
+_POLISHED = 2
+"""Rough fits of an effect that are refined to the end."""
 
 _NOISY = 3
 """Number of leading models that are also fitted under their process noise."""
@@ -175,7 +179,7 @@ class BeamSearch:
         fit = start
         for group in groups:
             [addition] = additions(fit, with_wide_grid(group, fit.model.prepared), self.settings.noise)[:1]
-            fit = _best([_added(fit, *begin) for begin in addition.starts])
+            fit = _with(fit, addition)
         return Candidate(fit, score(fit, self.basis, self.settings), move)
 
     def _expand(self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term]) -> None:
@@ -326,25 +330,28 @@ def _best(fits: Sequence[FittedModel]) -> FittedModel:
 
 def _with(fit: FittedModel, addition: Addition) -> FittedModel:
     """Return the fit with one more effect, from its best shapes."""
-    begun = [_begun(fit, term, size) for term, size in addition.starts]
-    best = max(found.log_likelihood for found in begun)
-    least = min(0.5 * (best + fit.log_likelihood), best)
-    near = [found for found in begun if found.log_likelihood >= least]
-    return with_form_of_grid(_best([shape_fitted(found) for found in near]))
+    begun = sorted((_begun(fit, term, size) for term, size in addition.starts), key=lambda found: -found.log_likelihood)
+    least = 0.5 * (begun[0].log_likelihood + fit.log_likelihood)
+    near = [found for number, found in enumerate(begun[:_POLISHED]) if number == 0 or found.log_likelihood >= least]
+    return with_form_of_grid(_best([_polished(found) for found in near]))
 
 
-def _added(fit: FittedModel, term: Term, size: torch.Tensor) -> FittedModel:
-    return shape_fitted(_begun(fit, term, size))
+def _polished(begun: FittedModel) -> FittedModel:
+    """Return a rough fit at the most likely sizes and shapes."""
+    if begun.model.terms[-1].effect.fitted_shape:
+        return shape_fitted(begun)
+    found = _refitted(begun, begun)
+    return begun if found is None else found
 
 
 def _begun(fit: FittedModel, term: Term, size: torch.Tensor) -> FittedModel:
-    """Return the fit with one more effect at a fixed shape, from its linear size, or from 0 if that gains nothing."""
+    """Return a rough fit with one more effect at a fixed shape: from its linear size, or from 0 if that is worse."""
     model = fit.model.with_term(term)
-    found = fitted_with_effect(fit, model, torch.cat([fit.parameters, size]), graduate=False)
+    found = fitted_with_effect(fit, model, torch.cat([fit.parameters, size]), graduate=False, rough=True)
     if found.log_likelihood > fit.log_likelihood:
         return found
     zero = torch.cat([fit.parameters, torch.zeros_like(size)])
-    return _best([found, fitted_with_effect(fit, model, zero, graduate=False)])
+    return _best([found, fitted_with_effect(fit, model, zero, graduate=False, rough=True)])
 
 
 def _without(fit: FittedModel, number: int) -> FittedModel | None:
@@ -361,7 +368,7 @@ def _exchanged(fit: FittedModel, number: int, group: Sequence[Term]) -> FittedMo
     if rest is None:
         return None
     zero = rest.parameters.new_zeros(rest.model.with_term(group[0]).size - rest.model.size)
-    return _best([_added(rest, term, zero) for term in group])
+    return _with(rest, Addition(tuple((term, zero) for term in group[:STARTS]), 0.0))
 
 
 def _refitted(start: FittedModel, like: FittedModel) -> FittedModel | None:

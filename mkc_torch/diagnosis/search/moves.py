@@ -26,6 +26,12 @@ _LONGEST = 3.0
 _RATIO = 2.0
 """Ratio of neighbouring lags and delays."""
 
+_OFFSET = 0.5
+"""Ratio of a signal's lowest to its highest value above which it is far from 0 throughout."""
+
+_SHARES = (0.2, 0.4, 0.6, 0.8)
+"""Levels tried in such a signal, as shares of its range."""
+
 STARTS = 3
 """Shapes from which an effect is fitted: the best local maxima of its linear gain."""
 
@@ -121,23 +127,27 @@ def local_maxima(terms: Sequence[Term], gains: Sequence[float]) -> list[int]:
 
 
 def with_wide_grid(terms: Sequence[Term], prepared: PreparedSimulation) -> tuple[Term, ...]:
-    """Return candidates with lags and delays from a sample to a third of the longest run, in ratios of two.
+    """Return candidates with wider grids: of lags and delays, and of levels of a signal with an offset.
 
-    Other shapes keep the grid of their effect.
+    Lags and delays go from a sample to a third of the longest run, in ratios of two. Levels that an effect states as
+    shares of a signal's largest value are tried at shares of its range too, if the signal is far from 0 throughout.
     """
     found: list[Term] = []
     done: set[Key] = set()
     for term in terms:
         names = [name for name in term.effect.fitted_shape if name in term.effect.continuous and name in term.shape]
-        if len(names) != 1 or len(term.shape) != 1:
+        if len(names) == 1 and len(term.shape) == 1:
+            if term.key not in done:
+                found += [replace(term, shape={names[0]: value}) for value in _lags(term, names[0], prepared)]
+        else:
+            if term.key not in done:
+                found += [replace(term, shape={**term.shape, **shape}) for shape in _levels(term, prepared)]
             found.append(term)
-        elif term.key not in done:
-            done.add(term.key)
-            found += [replace(term, shape={names[0]: value}) for value in _wide(term, names[0], prepared)]
+        done.add(term.key)
     return tuple(term for term in found if not within_a_sample(term, prepared))
 
 
-def _wide(term: Term, name: str, prepared: PreparedSimulation) -> Iterator[float]:
+def _lags(term: Term, name: str, prepared: PreparedSimulation) -> Iterator[float]:
     """Yield the values of a lag or delay within its limits."""
     low, high = reach_of(term, prepared)[name]
     step = prepared.time.diff()
@@ -146,6 +156,19 @@ def _wide(term: Term, name: str, prepared: PreparedSimulation) -> Iterator[float
     while value <= most:
         yield value
         value *= _RATIO
+
+
+def _levels(term: Term, prepared: PreparedSimulation) -> Iterator[dict[str, float]]:
+    """Yield levels within the range of a signal that is far from 0 throughout."""
+    effect, port = term.effect, prepared.ports[term.port]
+    for name in effect.fitted_shape:
+        part, which = effect.relative.get(name, ("", ""))
+        sizes = port.sizes.get(part)
+        if which != "largest" or sizes is None or not sizes.lowest > _OFFSET * sizes.highest > 0.0:
+            continue
+        low, high = reach_of(term, prepared)[name]
+        values = [sizes.lowest + share * (sizes.highest - sizes.lowest) for share in _SHARES]
+        yield from ({name: value} for value in values if low <= value <= high)
 
 
 def _longest_run(prepared: PreparedSimulation) -> float:
