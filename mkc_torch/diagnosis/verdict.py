@@ -175,7 +175,8 @@ def _disturbed_state(known: FitAssessment, *, findings: bool) -> Decision:
     """Count the disturbances; with a finding, a sensor's own slow error counts as noise."""
     all_of_them = () if known.noise is None else known.noise.selected.disturbances
     counted = [disturbance for disturbance in all_of_them if disturbance.at_rate or not findings]
-    text = f"{len(counted)} unrecorded disturbances act on states or outputs." if counted else "No disturbance acts."
+    names = ", ".join(dict.fromkeys(f"`{disturbance.place}`" for disturbance in counted))
+    text = f"An unrecorded disturbance acts on {names}." if counted else "No unrecorded disturbance acts."
     return _decision("disturbed_state", len(counted), 0.0, passed=not counted, sentence=text)
 
 

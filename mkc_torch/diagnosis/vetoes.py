@@ -70,18 +70,20 @@ def held_out_blocks(finding: Finding, context: VetoContext) -> Decision | None:
             return None
         text = "A quick look or a stopped search confirms by held-out blocks only, and no such gain is known."
         return _decision("held_out_blocks", finding, context, None, 0.0, passed=False, sentence=text)
-    gain, low = held.log_likelihood_gain, held.confidence_interval[0]
-    kind = confirmation(gain, held.confidence_interval)
+    gain, (low, high) = held.log_likelihood_gain, held.confidence_interval
+    kind, smaller = confirmation(gain, held.confidence_interval), 1.0 - mean_ratio(held)
+    text = f"The gain on held-out blocks is {gain:.2g} nats per sample"
     if not held.decides:
-        passed, least = not (kind == "worse" and mean_ratio(held) > 1.0 - SMALL), gain - held.confidence_interval[1]
-        limit = "they can only reject it"
+        passed, least = not (kind == "worse" and smaller < SMALL), gain - high
+        text += "; under process noise they can reject a finding, not confirm it."
     elif context.in_short or not better_on_average(held):
-        passed, least, limit = kind == "surely", gain - low, "half of its 95 % interval"
+        passed, least = kind == "surely", gain - low
+        text += f"; half of its 95 % interval is {least:.2g}."
     else:
-        passed, least, limit = True, 0.0, f"as the residual is {_percent(1.0 - mean_ratio(held))} smaller"
+        passed, least = True, 0.0
+        text += f", and the residual is {_percent(smaller)} smaller."
+    known = gain if math.isfinite(least) else None
     least = least if math.isfinite(least) else 0.0
-    known = gain if math.isfinite(low) else None
-    text = f"{gain:+.2g} nats per sample on held-out blocks; more than {least:.2g} is needed: {limit}."
     return _decision("held_out_blocks", finding, context, known, least, passed=passed, sentence=text)
 
 
@@ -161,7 +163,7 @@ def residual_reduction(finding: Finding, context: VetoContext) -> Decision | Non
     if held is None:
         return None
     less = change(held)
-    text = f"It reduces the residual of an output by at most {_percent(less)} on held-out blocks."
+    text = f"It reduces the residual of an output by up to {_percent(less)} on held-out blocks."
     return _decision("residual_reduction", finding, context, less, SMALL, passed=less >= SMALL, sentence=text)
 
 
