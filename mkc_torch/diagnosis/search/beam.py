@@ -170,14 +170,14 @@ class BeamSearch:
     ) -> Candidate:
         """Return the model of given effects with the highest score of several fits; the models stay as they are.
 
-        The effects are added in the given order and in the reverse order, each from the best shapes of its grid. Of
-        effects in series every order is tried, and the best fit is repeated under its process noise.
+        The effects are added in the given order and in the reverse order, each from the best shapes of its grid; for
+        effects in series every order is tried. The best fit is repeated under its process noise, as in the search.
 
         Args:
             groups: for each effect its candidates, one for each shape.
             start: the simulation alone.
             move: how the search came to it.
-            thorough: False for the given order and white noise only.
+            thorough: False for the given order only.
         """
         prepared = start.model.prepared
         orders = [tuple(groups), tuple(reversed(groups))] if thorough and len(groups) > 1 else [tuple(groups)]
@@ -188,7 +188,8 @@ class BeamSearch:
             others = [partial(_reordered, best.fit, order) for order in in_other_orders(best.fit)]
             works = [partial(self._scored, move, other) for other in others]
             found = [model for model in run_parallel(works, prepared, self.terms, "model") if model is not None]
-            best = self._with_noise(max([best, *found], key=lambda model: model.value))
+            best = max([best, *found], key=lambda model: model.value)
+        best = self._with_noise(best)
         return in_order(best, sorted(best.fit.model.terms, key=lambda term: _place_of(term, groups)))
 
     def _added_in_turn(self, groups: Sequence[Sequence[Term]], start: FittedModel) -> FittedModel:
