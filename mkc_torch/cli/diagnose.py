@@ -30,6 +30,7 @@ from mkc_torch.cli.diagnosis_request import (
     LEVEL,
     SIMULATIONS,
     SURROGATES,
+    SUSPECTED,
     TOGETHER,
     Outcome,
     Request,
@@ -102,6 +103,10 @@ def diagnose(
         list[str] | None,
         typer.Option(metavar="NAME=HOLD", help=f"Known course of an input between samples: {', '.join(INPUT_HOLDS)}."),
     ] = None,
+    suspect: Annotated[
+        list[str] | None,
+        typer.Option(metavar="EFFECTS", help=f"Suspected effects to score next to the findings: {SUSPECTED}."),
+    ] = None,
     level: Annotated[float, typer.Option(metavar="RATE", help="Accepted rate of false alarms.")] = LEVEL,
     surrogates: Annotated[
         int | None,
@@ -135,6 +140,7 @@ def diagnose(
         sensor=checked_sensor(sensor, simulation),
         noise=_noise(noise or []),
         input_hold=_input_hold(input_hold or []),
+        suspect=tuple(suspect or []),
         level=_level(level),
         surrogates=_surrogates(surrogates, level, quick=quick),
         seed=seed,

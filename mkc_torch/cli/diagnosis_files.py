@@ -211,6 +211,7 @@ def _outcome(
                     seed=request.seed,
                     noise=request.noise,
                     input_hold=request.input_hold,
+                    suspect=request.suspect,
                     quick=request.quick,
                     time_limit=request.time_limit,
                     progress=progress,

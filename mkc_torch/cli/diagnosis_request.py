@@ -15,6 +15,9 @@ INPUT_HOLDS = ("held", "linear", "smooth")
 LEVEL = 0.05
 SURROGATES = 99
 
+SUSPECTED = "coulomb_friction@speed + input_lag@command"
+"""An example of ``--suspect``."""
+
 TOGETHER = "together"
 """Folder of the results of ``--together``."""
 
@@ -34,6 +37,7 @@ class Request:
     sensor: str | None = None
     noise: Mapping[str, float] = field(default_factory=dict)
     input_hold: Mapping[str, str] = field(default_factory=dict)
+    suspect: tuple[str, ...] = ()
     level: float = LEVEL
     surrogates: int = SURROGATES
     seed: int = 0

@@ -118,6 +118,8 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
 
 def _of_all(diagnosis: Diagnosis, width: int) -> Iterator[tuple[str, str]]:
     d = diagnosis
+    for sentence in d.suspected:
+        yield "suspected", typeset(sentence)
     if len(d.findings) > 1:
         for change in unseen.residual_of_all(d):
             yield "together", f"on held-out data: {change}"

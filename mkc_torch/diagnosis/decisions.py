@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from mkc_torch.diagnosis.parts import EffectParameter
+
 
 @dataclass(frozen=True)
 class ScoredModel:
@@ -19,6 +21,7 @@ class ScoredModel:
         open_loop: RMS of the open-loop residual by output, in its unit; empty where the simulation loses the recording.
         chosen: whether the findings are those of this model.
         suspected: whether the user asked for this model.
+        parameters: of each of its effects, for a suspected model.
     """
 
     terms: tuple[str, ...]
@@ -29,6 +32,7 @@ class ScoredModel:
     open_loop: Mapping[str, float]
     chosen: bool = False
     suspected: bool = False
+    parameters: tuple[tuple[EffectParameter, ...], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from time import monotonic
 
 from mkc_torch._parallel.deadline import Stopped, limited
 from mkc_torch._parallel.progress import counting
+from mkc_torch.diagnosis.model.suspect import texts_of
 from mkc_torch.diagnosis.optional import optional_steps
 from mkc_torch.diagnosis.pipeline.partial import PartialResult, build_result, cut_short, estimate, run_tests
 from mkc_torch.diagnosis.pipeline.prepare import Problem, SearchOptions, prepare
@@ -42,6 +43,7 @@ def diagnose(
     settings: Settings = Settings(),  # noqa: B008 - frozen
     noise: Mapping[str, float] | None = None,
     input_hold: Mapping[str, str] | None = None,
+    suspect: str | Sequence[str] = (),
     quick: bool = False,
     time_limit: float | None = None,
     progress: Callable[[str], object] = lambda _: None,
@@ -74,6 +76,9 @@ def diagnose(
             estimated.
         input_hold: known input holds between two samples, "held" or "linear", by input; for the others the more likely
             hold is used. For differential equations only.
+        suspect: sets of effects to score in addition to those that the search finds, such as
+            "coulomb_friction@speed + input_lag@command"; ``suspected`` of the result compares them with the findings.
+            They do not change the search. For differential equations only.
         quick: True for a quick look without surrogates: candidates are accepted by likelihood less a penalty, leading
             candidates are refitted from fewer starts, and slow tests of evidence are left out. There are no p-values,
             and the rate of false alarms is unknown.
@@ -87,8 +92,8 @@ def diagnose(
 
     Raises:
         TypeError: an argument of another kind: the name of a simulation, of a file or of an effect, or a class.
-        ValueError: an argument out of range, too few samples, recordings whose columns or units differ, or a recording
-            that the simulation rejects.
+        ValueError: an argument out of range, too few samples, recordings whose columns or units differ, a recording
+            that the simulation rejects, or a suspected effect that the simulation does not have.
         MissingColumnError: the recording lacks a column that the simulation needs.
         TimeoutError: the time limit was over before the simulation's first fit had ended.
 
@@ -101,7 +106,9 @@ def diagnose(
     """
     begin = monotonic()
     declared, holds = {} if noise is None else noise, {} if input_hold is None else input_hold
-    options = SearchOptions(level, surrogates, max_findings, seed, settings, declared, holds, quick)
+    options = SearchOptions(
+        level, surrogates, max_findings, seed, settings, declared, holds, quick, suspect=texts_of(suspect)
+    )
     problem = prepare(simulation, recording, effects, options, time_limit, progress)
     limit = math.inf if time_limit is None else time_limit
     known = PartialResult(problem)

@@ -39,6 +39,7 @@ from mkc_torch.diagnosis.parts import (
     value_of,
 )
 from mkc_torch.diagnosis.plot.accessor import DiagnosisPlot
+from mkc_torch.diagnosis.suspected_sentences import suspected_sentences
 from mkc_torch.effects import words_of
 from mkc_torch.recording.disturbance import RejectedInterval
 from mkc_torch.recording.recording import Recording
@@ -254,6 +255,12 @@ class Diagnosis:
     def plot(self) -> DiagnosisPlot:
         """The figures of the report as axes of matplotlib, such as ``diagnosis.plot.residual()``."""
         return DiagnosisPlot(self.traces, self.findings, self.candidates, self.separability, self.environment)
+
+    @property
+    def suspected(self) -> tuple[str, ...]:
+        """A sentence for each suspected set of effects: its score next to that of the findings, and its residual."""
+        units = {fit.output: fit.unit for fit in self.environment.goodness_of_fit}
+        return suspected_sentences(self.decisions, units, findings=bool(self.findings))
 
     @property
     def ceiling(self) -> HeldOutScore | None:

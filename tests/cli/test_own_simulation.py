@@ -265,6 +265,19 @@ def test_noise_and_inputs_are_declared_by_name(thermistor, monkeypatch):
     assert "far enough" in result.stderr
     assert given["noise"] == {"voltage": 0.01, "other": 2.0, "third": 0.001}
     assert given["input_hold"] == {"temperature": "held"}
+    assert given["suspect"] == ()
+
+
+def test_suspicions_are_refused_without_differential_equations_and_passed_on(thermistor, monkeypatch):
+    given = {}
+    source, table, output = thermistor
+    command = ("diagnose", table, "--simulation", source, "--output", output, "--suspect", "gain", "--suspect", "lag")
+    result = mkc(*command)
+    assert result.exit_code == 1
+    assert "scored for differential equations only and Thermistor has none" in flat(result.stderr)
+    monkeypatch.setattr("mkc_torch.cli.diagnosis_files.diagnose", lambda *_, **options: given.update(options) or 1 / 0)
+    assert mkc(*command).exit_code == 1
+    assert given["suspect"] == ("gain", "lag")
 
 
 @pytest.mark.e2e

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from examples.concealed_physics import known
 from mkc_torch.cli.diagnosis_request import Request
 
 _PRELOADED = "mkc_torch.cli.diagnosis_files"
 """Imported once in the process that the others are forked from: no worker has to import torch."""
+
+
+KNOWN = ("real", "cases", "strangers")
+"""Parts of the gate whose recordings have right answers: functions of `examples.concealed_physics.known`."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +31,39 @@ class Job:
     name: str
     recording: Path
     request: Request
+
+
+def gate_folder(output: Path, name: str) -> Path:
+    """Return the folder of a recording's results."""
+    return output / name.replace(" ", "_").replace("/", "_")
+
+
+def known_answers(parts: Collection[str]) -> Iterator[known.Known]:
+    """Yield the recordings of some parts of the gate, and print the names of absent files."""
+    for part in KNOWN:
+        recordings: Callable[[], Iterator[known.Known]] = getattr(known, part)
+        for answer in recordings() if part in parts else ():
+            absent = [str(file) for file in (answer.recording, answer.file) if not file.exists()]
+            if absent:
+                print(f"left out: {', '.join(absent)} is absent")
+            else:
+                yield answer
+
+
+def known_jobs(parts: Collection[str], match: str, names: Collection[str]) -> list[Job]:
+    """Return the jobs of recordings with these names, whose name contains a text."""
+    answers = [answer for answer in known_answers(parts) if match in answer.name and answer.name in names]
+    return [Job(answer.name, answer.recording, answer.request) for answer in answers]
+
+
+def add_options(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    """Add the options of a command on the results of a gate."""
+    parser.add_argument("--gate", type=Path, required=True, help="output folder of the gate")
+    parser.add_argument("--workers", type=int, default=2, help="parallel processes")
+    parser.add_argument("--only", nargs="+", choices=KNOWN, default=KNOWN, help="parts of the gate")
+    parser.add_argument("--match", default="", help="only recordings whose name contains this text")
+    parser.add_argument("--limit", type=float, default=900.0, help="time limit of a recording in wall seconds")
+    return parser
 
 
 def diagnosed(
@@ -46,7 +85,7 @@ def diagnosed(
     os.environ["OMP_NUM_THREADS"] = "1"
 
     def diagnosed_row(job: Job) -> dict[str, Any]:
-        folder = output / job.name.replace(" ", "_").replace("/", "_")
+        folder = gate_folder(output, job.name)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "row.json").unlink(missing_ok=True)
         started = time.perf_counter()

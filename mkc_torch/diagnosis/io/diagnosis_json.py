@@ -160,11 +160,16 @@ def decisions_json(trail: Trail) -> dict[str, Any]:
                 "open_loop": {name: _known(value) for name, value in model.open_loop.items()},
                 "chosen": model.chosen,
                 "suspected": model.suspected,
+                **({"parameters": _of_terms(model.parameters)} if model.parameters else {}),
             }
             for model in trail.models
         ],
         "decisions": [asdict(decision) | {"value": _known(decision.value)} for decision in trail.decisions],
     }
+
+
+def _of_terms(parameters: Sequence[Sequence[EffectParameter]]) -> list[list[dict[str, Any]]]:
+    return [[_parameter(parameter) for parameter in own] for own in parameters]
 
 
 def _finite(value: float) -> float | None:
@@ -220,6 +225,7 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "ceiling": None,
         "advice": d.advice,
         "warnings": d.warnings,
+        **({"suspected": d.suspected} if d.suspected else {}),
         "decisions": decisions_json(d.decisions),
         "notes": d.notes,
         "rejected_intervals": d.rejected_intervals,

@@ -11,12 +11,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from typing import NamedTuple
 
-from mkc_torch._support.arguments import refuse_other_type
-from mkc_torch.diagnosis.model.shapes import ports_of
+from mkc_torch._support.arguments import format_value, refuse_other_type
+from mkc_torch.diagnosis.model.shapes import candidates_of, ports_of
 from mkc_torch.diagnosis.model.term import Key, Term
+from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
-from mkc_torch.simulation.protocol import PreparedSimulation
+from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
 EXAMPLE = "coulomb_friction@speed + input_lag@command + driver_input_gain@current(temperature)"
 """A text for messages and help."""
@@ -97,6 +98,58 @@ def suspected_terms(text: str, terms: Sequence[Term], prepared: PreparedSimulati
             known[key] = suspect_id(next(term for term in found if term.key == key), terms)
         chosen.append(found)
     return tuple(chosen)
+
+
+def texts_of(suspect: object) -> tuple[str, ...]:
+    """Return the texts of the suspected sets of effects, of which one can be given alone.
+
+    Raises:
+        TypeError: neither a text nor a sequence of texts.
+
+    Example:
+        >>> texts_of("input_lag@command"), texts_of(["gain", "offset"]), texts_of(())
+        (('input_lag@command',), ('gain', 'offset'), ())
+    """
+    texts = (suspect,) if isinstance(suspect, str) else suspect
+    if not isinstance(texts, (list, tuple)):
+        raise TypeError(
+            f"Expected argument `suspect` to be a text or a sequence of texts but got {format_value(suspect)}; write, "
+            f"for example, {EXAMPLE!r}."
+        )
+    for number, text in enumerate(texts):
+        refuse_other_type(f"suspect[{number}]", text, str, "text", f"write, for example, {EXAMPLE!r}")
+    return tuple(texts)
+
+
+def refuse_unknown(
+    texts: Sequence[str],
+    simulation: Simulation,
+    prepared: PreparedSimulation,
+    effects: Sequence[Effect],
+    settings: DriverSettings,
+) -> None:
+    """Raise for suspected effects that the search could not score.
+
+    Args:
+        texts: the suspected sets of effects.
+        simulation: as given by the user.
+        prepared: the simulation with its recording.
+        effects: the catalogue.
+        settings: which columns are drivers.
+
+    Raises:
+        ValueError: the simulation has no differential equations, or a text is refused by :func:`suspected_terms`.
+    """
+    if not texts:
+        return
+    if prepared.dynamics is None:
+        raise ValueError(
+            "Expected argument `suspect` to be empty, because suspected effects are scored for differential equations "
+            f"only and {prepared.name} has none, but got {texts[0]!r}; leave it out."
+        )
+    terms = candidates_of(simulation, prepared.open_loop(), effects, settings)[1]
+    for text in texts:
+        suspected_terms(text, terms, prepared)
 
 
 def suspect_id(term: Term, terms: Sequence[Term] = ()) -> str:

@@ -8,21 +8,21 @@ from dataclasses import replace
 
 import torch
 
-from mkc_torch.diagnosis.decisions import ScoredModel
 from mkc_torch.diagnosis.evidence.held_out import Evidence, blocks_of, gain_interval, held_out, on_all
 from mkc_torch.diagnosis.goodness_of_fit import size_of
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import (
     ProcessNoiseFit,
     first_samples,
-    has_process_noise,
 )
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
-from mkc_torch.diagnosis.score import basis_of
-from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate, called, in_order
+from mkc_torch.diagnosis.pipeline.suspected import suspected_models
+from mkc_torch.diagnosis.pipeline.trail import trail_of
+from mkc_torch.diagnosis.score import basis_of, score
+from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate, in_order
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.search.screening import screened
@@ -74,15 +74,18 @@ def search_models(
     keep(replace(search, first=first))
     search = replace(search, first=first, evidence=(_evidence(search, fit, options),))
     keep(search)
-    if options.max_findings == 0:
+    if options.max_findings == 0 and not options.suspect:
         return replace(search, left=())
     beam = _beam(base, first, terms, options)
-    best = beam.best
+    start = beam.models[()].fit
+    suspected = suspected_models(options.suspect, beam, start, settings.noise, quick=options.quick)
+    search = replace(search, models=(*trail_of(beam, None), *suspected))
+    keep(search)
+    if options.max_findings == 0:
+        return replace(search, left=())
     if first.p_value > options.level:
         follow = _follow(beam) if not options.quick else ()
-        trail = _trail(beam, None)
-        return replace(search, left=(), first=replace(first, follow=follow), models=trail)
-    search = replace(search, models=_trail(beam, best))
+        return replace(search, left=(), first=replace(first, follow=follow))
     for model in _in_turn(beam):
         found = _tested(search, model, beam, base, options, generator, keep)
         if found.found or not found.unconfirmed:
@@ -107,7 +110,10 @@ def _screened(
 
 
 def _beam(base: ProcessNoiseFit, first: SearchResult, terms: tuple[Term, ...], options: SearchOptions) -> BeamSearch:
-    """Search the models; without a significant candidate, only those with one effect."""
+    """Search the models; without a significant candidate, only those with one effect.
+
+    Where no finding is wanted, only the simulation alone is scored.
+    """
     start = base.fit if base.free is None else base.free
     basis = basis_of(base.fit, len({term.key for term in terms}), options.declared, options.settings)
     leaders = [terms[rival.number] for rival in first.ranking[: options.settings.search.own_noise]]
@@ -116,6 +122,9 @@ def _beam(base: ProcessNoiseFit, first: SearchResult, terms: tuple[Term, ...], o
     if options.quick:
         beam.most_models = _QUICK_MODELS
     beam.most_terms = min(beam.most_terms, options.max_findings) if significant else 1
+    if options.max_findings == 0:
+        beam.models[()] = Candidate(start, score(start, basis, options.settings), "")
+        return beam
     beam.run(start, leaders if significant else ())
     return beam
 
@@ -162,6 +171,8 @@ def _tested(
         search = replace(
             search, found=(*search.found, located), evidence=(*search.evidence, after), pairs=pairs, left=()
         )
+        suspected = (model for model in search.models if model.suspected)
+        search = replace(search, models=(*trail_of(beam, fit), *suspected))
         keep(search)
     return replace(search, left=())
 
@@ -253,38 +264,3 @@ def _follow(beam: BeamSearch) -> tuple[FittedModel, ...]:
     far = [fit for fit in fits if float((size_of(fit.residual) / free).log().mean()) < math.log(FAR_LESS)]
     named = [fit for fit in far if not fit.model.terms[-1].effect.is_generalisation]
     return tuple(named or far)
-
-
-def _trail(beam: BeamSearch, chosen: Candidate | None) -> tuple[ScoredModel, ...]:
-    """Return the scored models for the trail, in the order in which they were tried."""
-    return tuple(_scored(model, chosen=model is chosen) for model in beam.models.values())
-
-
-def _scored(model: Candidate, *, chosen: bool) -> ScoredModel:
-    score, fit = model.score, model.fit
-    prepared = fit.model.prepared
-    parts: dict[str, float] = {}
-    noise = ""
-    if score is not None:
-        parts = {
-            "log_likelihood": score.log_likelihood,
-            "numbers": score.numbers,
-            "terms": score.terms,
-            "disturbances": score.disturbances,
-            "forms": score.forms,
-        }
-        system = prepared.dynamics
-        assert system is not None
-        names = [
-            f"{'process noise of' if disturbance.at_rate else 'drift of'} {disturbance.place}"
-            for disturbance in score.noise.disturbances(system.disturbable, system.channels)
-        ]
-        noise = ", ".join(names) or "white"
-    residual = {} if has_process_noise(fit) else dict(zip(prepared.channels, _rms(fit), strict=True))
-    terms = tuple(called(term) for term in fit.model.terms)
-    return ScoredModel(terms, model.move, None if score is None else score.value, parts, noise, residual, chosen)
-
-
-def _rms(fit: FittedModel) -> list[float]:
-    sizes: list[float] = fit.residual.square().mean(0).sqrt().tolist()
-    return sizes

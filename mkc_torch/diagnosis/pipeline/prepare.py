@@ -10,6 +10,7 @@ import torch
 
 from mkc_torch._support.arguments import checked_number, checked_whole, format_value, refuse_other_type
 from mkc_torch._support.arrays import is_frame
+from mkc_torch.diagnosis.model.suspect import refuse_unknown
 from mkc_torch.diagnosis.settings import Settings, quick_settings
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.given_columns import EXPERIMENT
@@ -22,7 +23,7 @@ from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 class SearchOptions:
     """The options of :func:`diagnose`.
 
-    ``judged`` is True if held-out blocks test the candidates.
+    ``judged`` is True if held-out blocks test the candidates; ``suspect`` holds the suspected sets of effects as texts.
     """
 
     level: float
@@ -34,6 +35,7 @@ class SearchOptions:
     fixed: Mapping[str, str] = field(default_factory=dict)
     quick: bool = False
     judged: bool = True
+    suspect: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,7 @@ def prepare(
         judged=not _unjudged(options, prepared),
     )
     prepared = prepared.with_input_hold(options.fixed)
+    refuse_unknown(options.suspect, simulation, prepared, effects, settings.drivers)
     counts = run_counts(several) if names else ()
     return Problem(simulation, prepared, effects, options, names, counts, progress)
 

@@ -13,6 +13,7 @@ from mkc_torch.diagnosis.model.fit import FittedModel, fitted, fitted_with_effec
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise, has_process_noise
 from mkc_torch.diagnosis.model.shapes import shape_fitted, with_form_of_grid, with_profiled_shape
+from mkc_torch.diagnosis.model.suspect import suspect_id
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
 from mkc_torch.diagnosis.score import Score, ScoreBasis, score
 from mkc_torch.diagnosis.search.moves import (
@@ -168,19 +169,41 @@ class BeamSearch:
         least = ranked[0].value - 0.5 * (ranked[0].value - alone) - self.basis.number
         return [model for rank, model in enumerate(ranked[:WIDTH]) if rank < LEAST_WIDTH or model.value >= least]
 
-    def fitted_set(self, groups: Sequence[Sequence[Term]], start: FittedModel, move: str) -> Candidate:
-        """Return the model of given effects, added one after the other, each from the best shapes of its grid.
+    def fitted_set(
+        self, groups: Sequence[Sequence[Term]], start: FittedModel, move: str, *, thorough: bool = True
+    ) -> Candidate:
+        """Return the model of given effects with the highest score of several fits; the models stay as they are.
+
+        The effects are added in the given order and in the reverse order, each from the best shapes of its grid; for
+        effects in series every order is tried. The best fit is repeated under its process noise, as in the search.
 
         Args:
             groups: for each effect its candidates, one for each shape.
             start: the simulation alone.
             move: how the search came to it.
+            thorough: False for the given order only.
         """
+        prepared = start.model.prepared
+        orders = [tuple(groups), tuple(reversed(groups))] if thorough and len(groups) > 1 else [tuple(groups)]
+        works = [partial(self._scored, move, partial(self._added_in_turn, order, start)) for order in orders]
+        found = [model for model in run_parallel(works, prepared, self.terms, "model") if model is not None]
+        best = max(found, key=lambda model: model.value)
+        if thorough:
+            others = [partial(_reordered, best.fit, order) for order in in_other_orders(best.fit)]
+            works = [partial(self._scored, move, other) for other in others]
+            found = [model for model in run_parallel(works, prepared, self.terms, "model") if model is not None]
+            best = max([best, *found], key=lambda model: model.value)
+        best = self.under_noise(best)
+        return in_order(best, sorted(best.fit.model.terms, key=lambda term: _place_of(term, groups)))
+
+    def _added_in_turn(self, groups: Sequence[Sequence[Term]], start: FittedModel) -> FittedModel:
+        """Return a fit with more effects, added one after the other."""
         fit = start
         for group in groups:
-            [addition] = additions(fit, with_wide_grid(group, fit.model.prepared), self.settings.noise)[:1]
+            wide = with_wide_grid(group, fit.model.prepared) or tuple(group)
+            [addition] = additions(fit, wide, self.settings.noise)[:1]
             fit = _with(fit, addition)
-        return Candidate(fit, score(fit, self.basis, self.settings), move)
+        return fit
 
     def _expand(self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term]) -> None:
         """Fit and score the models that one move leads to."""
@@ -189,14 +212,14 @@ class BeamSearch:
         if have < self.most_terms and not any(term.effect.is_curve for term in fit.model.terms):
             for addition in self._chosen(additions(fit, terms, self.settings.noise), model, rank, further):
                 key = model_key([*fit.model.terms, addition.starts[0][0]])
-                works.append((key, f"add {called(addition.starts[0][0])}", partial(_with, fit, addition)))
+                works.append((key, f"add {self._id(addition.starts[0][0])}", partial(_with, fit, addition)))
         for number, term in enumerate(fit.model.terms):
             if have > 1:
                 rest = [other for other in fit.model.terms if other is not term]
-                works.append((model_key(rest), f"drop {called(term)}", partial(_without, fit, number)))
+                works.append((model_key(rest), f"drop {self._id(term)}", partial(_without, fit, number)))
             for other in special_cases(term, self.terms, fit.model.prepared):
                 rest = [*fit.model.terms[:number], *fit.model.terms[number + 1 :], other]
-                move = f"exchange {called(term)} for {called(other)}"
+                move = f"exchange {self._id(term)} for {self._id(other)}"
                 works.append((model_key(rest), move, partial(_exchanged, fit, number, self._all(other))))
         orders = in_other_orders(fit)
         works += [(model_key(o), "another order in series", partial(_reordered, fit, o)) for o in orders]
@@ -209,7 +232,7 @@ class BeamSearch:
             (model_key([other for other in fit.model.terms if other is not term]), number, term)
             for number, term in enumerate(fit.model.terms)
         ]
-        works = [(key, f"drop {called(term)}", partial(_without, fit, number)) for key, number, term in rests]
+        works = [(key, f"drop {self._id(term)}", partial(_without, fit, number)) for key, number, term in rests]
         self._fit(works, fit, len(self.models) + len(works))
         return [self.models[key] for key, _, _ in rests if key in self.models]
 
@@ -235,6 +258,9 @@ class BeamSearch:
         naming = self.settings.naming
         form = naming.is_generalisation * term.effect.is_generalisation + naming.nameless * term.effect.is_curve
         return self.basis.number * (len(size) + len(term.effect.fitted_shape)) + self.basis.choice + form
+
+    def _id(self, term: Term) -> str:
+        return suspect_id(term, self.terms)
 
     def _all(self, term: Term) -> tuple[Term, ...]:
         return tuple(other for other in self.terms if other.key == term.key)
@@ -318,10 +344,8 @@ def in_order(model: Candidate, terms: Sequence[Term]) -> Candidate:
     return replace(model, fit=replace(fit, model=ordered, parameters=parameters))
 
 
-def called(term: Term) -> str:
-    """Return an effect with its place and its columns, for the trail."""
-    columns = f"({','.join(term.columns)})" if term.columns else ""
-    return f"{term.effect.id}@{term.port}{columns}"
+def _place_of(term: Term, groups: Sequence[Sequence[Term]]) -> int:
+    return next(number for number, group in enumerate(groups) if term.key in {other.key for other in group})
 
 
 def _best(fits: Sequence[FittedModel]) -> FittedModel:

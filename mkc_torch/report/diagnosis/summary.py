@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from mkc_torch._support.typesetting import capital, plain
+from mkc_torch._support.typesetting import capital, plain, typeset
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.effects import is_curve
 from mkc_torch.report.diagnosis.environment import noise_lines, output_lines
@@ -25,14 +25,15 @@ def summary(diagnosis: Diagnosis) -> list[Row]:
     d = diagnosis
     follows = output_lines(d)
     rows = [_row("fit", *follows)] if follows else []
+    suspected = [_row("suspected", *(typeset(sentence) for sentence in d.suspected))] if d.suspected else []
     if d.verdict == "unfit":
-        return [*rows, *([_row("why", *reasons(d))] if d.environment.reasons else [])]
+        return [*rows, *([_row("why", *reasons(d))] if d.environment.reasons else []), *suspected]
     noise = _row("noise", *(noise_lines(d) or [f"{capital(noise_model(d.noise))}."]))
     rows += [noise, *_of_findings(d)] if follows else [*_of_findings(d), noise]
     smooth = "" if d.findings else smooth_fit(d)
     if smooth:
         rows.append(_row("for comparison", f"{capital(smooth)}."))
-    return rows
+    return [*rows, *suspected]
 
 
 def _row(label: str, *lines: str) -> Row:
