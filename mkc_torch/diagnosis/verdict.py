@@ -63,12 +63,14 @@ class FitAssessment:
         corrected: goodness of fit with the findings, by output.
         noise: the remaining noise of differential equations; None for other simulations.
         lost: True if no finding can make the fit good: the recorded rotations are wrong.
+        column: the column whose other sign or unit explains more than any effect, in a sentence; empty if none does.
     """
 
     follows: tuple[GoodnessOfFit, ...]
     corrected: tuple[GoodnessOfFit, ...]
     noise: StateSpaceNoise | None
     lost: bool = False
+    column: str = ""
 
     @property
     def explained(self) -> float | None:
@@ -81,7 +83,7 @@ class FitAssessment:
 
     def unfit(self, settings: EvidenceSettings) -> bool:
         """Whether the simulation explains too little of the variation, both without and with its findings."""
-        if self.lost:
+        if self.lost or self.column:
             return True
         if not poor_fits(self.follows, settings.followed):
             return False
@@ -153,6 +155,8 @@ def _explained_share(known: FitAssessment, settings: EvidenceSettings) -> Decisi
     share = known.explained
     if known.lost:
         text = "The recorded rotations are impossible, so no finding can make the fit good."
+    elif known.column:
+        text = known.column
     elif share is None:
         text = "No open-loop simulation with a finite trajectory is known."
     else:

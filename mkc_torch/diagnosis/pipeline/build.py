@@ -85,7 +85,7 @@ def noise_environment(
     reasons: tuple[str, ...] = ()
     if unfit:
         fits = [base.fit] if base.free is None else [base.fit, base.free]
-        reasons = reasons_of(fits, known.follows)
+        reasons = (known.column,) if known.column else reasons_of(fits, known.follows)
     if prepared is None or known.noise is None:
         return NoiseEnvironment(known.follows, reasons, starts=base.starts)
     model, theta = final.model, final.parameters
@@ -118,6 +118,7 @@ class DiagnosisInputs:
         cut: whether there was a further finding beyond the limit.
         stop: why the search was stopped before its end, and what was not done.
         models: the models that the search scored, in their order.
+        column: the column whose other sign or unit explains more than any effect, in a sentence; empty if none does.
     """
 
     simulation: Simulation
@@ -129,6 +130,7 @@ class DiagnosisInputs:
     cut: bool
     stop: Stop | None = None
     models: tuple[ScoredModel, ...] = ()
+    column: str = ""
 
     @property
     def in_short(self) -> bool:
@@ -276,7 +278,8 @@ def _assessment(whole: DiagnosisInputs) -> FitAssessment:
 
     if whole.stop is not None:
         return within(_MOMENT_S, work) or bare()
-    return optional("assessing the fit with the findings", work, bare)
+    known = optional("assessing the fit with the findings", work, bare)
+    return replace(known, column=whole.column)
 
 
 def _environment(whole: DiagnosisInputs, known: FitAssessment, *, unfit: bool) -> NoiseEnvironment:

@@ -150,7 +150,16 @@ class PartialResult:
         final = search.found[-1].fit if search.found else self.base
         drivers, terms = self.candidates
         whole = DiagnosisInputs(
-            self.simulation, drivers, terms, self.fitted_baseline, final, self.options, search.cut, stop, search.models
+            self.simulation,
+            drivers,
+            terms,
+            self.fitted_baseline,
+            final,
+            self.options,
+            search.cut,
+            stop,
+            search.models,
+            search.column,
         )
         result = with_search_notes(build_diagnosis(whole, answers), search)
         offsets = offsets_of(answers.case.final, self.recordings) if self.recordings else ()

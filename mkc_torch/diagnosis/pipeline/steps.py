@@ -26,6 +26,7 @@ class StepwiseSearch:
         given_up: why the next search failed; empty if it did not.
         cut: whether there was a further finding beyond the limit.
         models: the models that the search scored, in the order in which they were tried.
+        column: the column whose other sign or unit explains more than any effect, in a sentence; empty if none does.
     """
 
     first: SearchResult | None
@@ -39,6 +40,7 @@ class StepwiseSearch:
     given_up: str = ""
     cut: bool = False
     models: tuple[ScoredModel, ...] = ()
+    column: str = ""
 
     @property
     def parts(self) -> tuple[object, ...]:
