@@ -31,14 +31,30 @@ _WIDE = 1.2
 _DOMAIN_SCALES = 2.5
 """Least half-width of a domain in robust scales, so that 2 are left in each fold: the least that a fit accepts."""
 
-_NARROWER = 2
-"""Restarts of a fit with such a scale from its own end."""
 
-_ROUGH_STEPS = 12
-"""Steps of a rough fit."""
+@dataclass(frozen=True)
+class Effort:
+    """How far a fit goes.
 
-_ROUGH_TOLERANCE = 1e-4
-"""Gain in nats per sample below which a rough fit ends."""
+    Attributes:
+        steps: number of steps at most.
+        tolerance: gain in nats per sample below which it ends.
+        restarts: restarts from its own end, where a scale may belong to another optimum.
+    """
+
+    steps: int
+    tolerance: float
+    restarts: int
+
+
+FULL = Effort(60, 1e-7, 2)
+"""A fit to the end."""
+
+SEARCH = Effort(30, 3e-6, 0)
+"""A fit whose likelihood is compared with others: 0.01 nats on 3,000 samples."""
+
+ROUGH = Effort(12, 1e-4, 0)
+"""A fit that chooses between starts."""
 
 _SHARES = (1.0, 0.3, 0.1, 0.01, 0.0)
 """Shares of an effect's initial size to try in turn if the simulation has no finite result."""
@@ -106,7 +122,7 @@ def fitted(
     rows: Float[Tensor, " N"] | None = None,
     graduate: bool = True,
     fresh: bool = False,
-    rough: bool = False,
+    effort: Effort = FULL,
 ) -> FittedModel:
     """Fit a joint model by maximum likelihood.
 
@@ -118,13 +134,13 @@ def fitted(
         graduate: False for a start near the solution.
         fresh: True to also search for a trajectory without the model's own as the start, if there is none near that:
             it may belong to another noise model. This is slow.
-        rough: True for a few steps only, to compare starts.
+        effort: how far the fit goes.
 
     Raises:
         NoFitError: the simulation has no finite result at the start or at the end of the fit.
     """
-    found = _fit(*_finite_start(model, start, fresh=fresh), bound, rows, graduate=graduate, rough=rough)
-    for _ in range(0 if rough else _NARROWER):
+    found = _fit(*_finite_start(model, start, fresh=fresh), bound, rows, graduate=graduate, effort=effort)
+    for _ in range(effort.restarts):
         seen = found.residual if rows is None else found.residual[rows > 0]
         if not bool((found.d > _WIDE * robust_scale(seen)).any()):
             break
@@ -143,7 +159,7 @@ def _fit(
     rows: Float[Tensor, " N"] | None,
     *,
     graduate: bool,
-    rough: bool = False,
+    effort: Effort = FULL,
 ) -> FittedModel:
     way = model.continuation()
     found = nonlinear.fit(
@@ -156,8 +172,8 @@ def _fit(
         upper=None if model.bounds is None else model.bounds[1],
         graduate=graduate,
         covariance=None,
-        max_iter=_ROUGH_STEPS if rough else 60,
-        tol=_ROUGH_TOLERANCE if rough else 1e-7,
+        max_iter=effort.steps,
+        tol=effort.tolerance,
         jacobian=model.prepared.jacobian,
     )
     there = model.begun_with(way.near(found.theta))
@@ -178,11 +194,11 @@ def _fit(
 
 
 def fitted_with_effect(
-    base: FittedModel, model: JointModel, start: Float[Tensor, " p"], *, graduate: bool = True, rough: bool = False
+    base: FittedModel, model: JointModel, start: Float[Tensor, " p"], *, graduate: bool = True, effort: Effort = FULL
 ) -> FittedModel:
     """Fit a model with one more effect on the domain of a fit without it; return the latter if this fails."""
     try:
-        return fitted(model, start, base.bound, graduate=graduate, rough=rough)
+        return fitted(model, start, base.bound, graduate=graduate, effort=effort)
     except nonlinear.NoFitError:
         none = base.parameters.new_zeros(model.size - base.model.size)
         return replace(base, model=model, parameters=torch.cat([base.parameters, none]))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.fit import FULL, Effort, FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Driver, Drivers, Term, find_drivers, run_parallel
 from mkc_torch.diagnosis.settings import DriverSettings
@@ -266,11 +266,12 @@ class ShapedModel(JointModel):
         return ShapedModel(JointModel(self.prepared, self.terms, near), self._reach)
 
 
-def shape_fitted(fit: FittedModel) -> FittedModel:
+def shape_fitted(fit: FittedModel, effort: Effort = FULL) -> FittedModel:
     """Refit with the shape numbers free.
 
     Args:
         fit: at the most likely parameters for its present shapes.
+        effort: how far the fit goes.
 
     Returns:
         The fit at the most likely shapes; the same fit if no number can be fitted, or no result is more likely.
@@ -279,7 +280,7 @@ def shape_fitted(fit: FittedModel) -> FittedModel:
     if model.size == model.joint:
         return fit
     try:
-        both = fitted(model, model.start(fit.parameters), fit.bound, graduate=False)
+        both = fitted(model, model.start(fit.parameters), fit.bound, graduate=False, effort=effort)
     except NoFitError:
         return fit
     if not both.log_likelihood > fit.log_likelihood:
@@ -319,7 +320,7 @@ def with_profiled_shape(fit: FittedModel) -> FittedModel:
     return fit
 
 
-def with_form_of_grid(fit: FittedModel) -> FittedModel:
+def with_form_of_grid(fit: FittedModel, effort: Effort = FULL) -> FittedModel:
     """Return the fit with the form of its last effect, such as a width, moved along its grid while it is more likely.
 
     The search chooses a form by its linearised gain, which differs little between forms, but the joint fits can differ
@@ -327,24 +328,25 @@ def with_form_of_grid(fit: FittedModel) -> FittedModel:
 
     Args:
         fit: with at least one effect, at its most likely parameters.
+        effort: how far each fit goes.
     """
     effect, prepared = fit.model.terms[-1].effect, fit.model.prepared
     for name in set(effect.form_parameters) & set(effect.relative):
         port = prepared.ports[fit.model.terms[-1].port]
         grid = sorted({absolute(effect, shape, port)[name] for shape in effect.shapes(prepared.time)})
         for steps in (-1, 1):
-            while (moved := _at_next(fit, name, grid, steps)) is not None:
+            while (moved := _at_next(fit, name, grid, steps, effort)) is not None:
                 fit = moved
     return fit
 
 
-def _at_next(fit: FittedModel, name: str, grid: Sequence[float], steps: int) -> FittedModel | None:
+def _at_next(fit: FittedModel, name: str, grid: Sequence[float], steps: int, effort: Effort) -> FittedModel | None:
     """Refit with the next value of a number on its grid; None at the end, and where that is not more likely."""
     term = fit.model.terms[-1]
     place = min(range(len(grid)), key=lambda k: abs(grid[k] - term.shape[name])) + steps
     if not 0 <= place < len(grid):
         return None
-    other = _with_last(fit, replace(term, shape={**term.shape, name: grid[place]}))
+    other = _with_last(fit, replace(term, shape={**term.shape, name: grid[place]}), effort)
     more = other is not None and other.log_likelihood > fit.log_likelihood + _SETTLED_NATS
     return other if more else None
 
@@ -360,9 +362,9 @@ def _varied(fit: FittedModel) -> Iterator[Term]:
                 yield replace(term, shape={**term.shape, name: value})
 
 
-def _with_last(fit: FittedModel, term: Term) -> FittedModel | None:
+def _with_last(fit: FittedModel, term: Term, effort: Effort = FULL) -> FittedModel | None:
     """Refit with another shape of the last effect; None if there is no finite trajectory."""
     try:
-        return fitted(fit.model.with_last(term), fit.parameters, fit.bound, graduate=False)
+        return fitted(fit.model.with_last(term), fit.parameters, fit.bound, graduate=False, effort=effort)
     except NoFitError:
         return None

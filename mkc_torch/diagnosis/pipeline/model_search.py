@@ -236,7 +236,7 @@ def _final(step: Candidate, beam: BeamSearch, options: SearchOptions, *, last: b
     """Return a model at its best shape, noise and, of the last, holds of the inputs, each by its score."""
     if options.quick:
         return step
-    step = beam.under_noise(beam.profiled(step))
+    step = beam.under_noise(beam.to_the_end(step))
     return beam.with_best_hold(step, options.fixed) if last else step
 
 

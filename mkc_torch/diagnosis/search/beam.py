@@ -9,7 +9,7 @@ from functools import cached_property, partial
 
 import torch
 
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted, fitted_with_effect, without_term
+from mkc_torch.diagnosis.model.fit import ROUGH, SEARCH, FittedModel, fitted, fitted_with_effect, without_term
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise, has_process_noise
 from mkc_torch.diagnosis.model.shapes import shape_fitted, with_form_of_grid, with_profiled_shape
@@ -315,9 +315,15 @@ class BeamSearch:
                     model = model if held is None else self._better(model, held)
         return model
 
-    def profiled(self, model: Candidate) -> Candidate:
-        """Return a model with the delay or lag of its last effect on an input at the maximum of its profile."""
-        return self._better(model, with_profiled_shape(model.fit))
+    def to_the_end(self, model: Candidate) -> Candidate:
+        """Return a model fitted to the end; a delay or lag of its last effect on an input is profiled.
+
+        Raises:
+            NoFitError: the fit loses the recording.
+        """
+        fit = model.fit
+        whole = fitted(fit.model, fit.parameters, fit.bound, graduate=False)
+        return self._better(model, with_profiled_shape(shape_fitted(whole)))
 
     def _better(self, model: Candidate, fit: FittedModel) -> Candidate:
         if fit is model.fit:
@@ -357,13 +363,13 @@ def _with(fit: FittedModel, addition: Addition) -> FittedModel:
     begun = sorted((_begun(fit, term, size) for term, size in addition.starts), key=lambda found: -found.log_likelihood)
     least = 0.5 * (begun[0].log_likelihood + fit.log_likelihood)
     near = [found for number, found in enumerate(begun[:_POLISHED]) if number == 0 or found.log_likelihood >= least]
-    return with_form_of_grid(_best([_polished(found) for found in near]))
+    return with_form_of_grid(_best([_polished(found) for found in near]), SEARCH)
 
 
 def _polished(begun: FittedModel) -> FittedModel:
     """Return a rough fit at the most likely sizes and shapes."""
     if begun.model.terms[-1].effect.fitted_shape:
-        return shape_fitted(begun)
+        return shape_fitted(begun, SEARCH)
     found = _refitted(begun, begun)
     return begun if found is None else found
 
@@ -371,17 +377,17 @@ def _polished(begun: FittedModel) -> FittedModel:
 def _begun(fit: FittedModel, term: Term, size: torch.Tensor) -> FittedModel:
     """Return a rough fit with one more effect at a fixed shape: from its linear size, or from 0 if that is worse."""
     model = fit.model.with_term(term)
-    found = fitted_with_effect(fit, model, torch.cat([fit.parameters, size]), graduate=False, rough=True)
+    found = fitted_with_effect(fit, model, torch.cat([fit.parameters, size]), graduate=False, effort=ROUGH)
     if found.log_likelihood > fit.log_likelihood:
         return found
     zero = torch.cat([fit.parameters, torch.zeros_like(size)])
-    return _best([found, fitted_with_effect(fit, model, zero, graduate=False, rough=True)])
+    return _best([found, fitted_with_effect(fit, model, zero, graduate=False, effort=ROUGH)])
 
 
 def _without(fit: FittedModel, number: int) -> FittedModel | None:
     start = without_term(fit, number)
     try:
-        return shape_fitted(fitted(start.model, start.parameters, fit.bound, graduate=False))
+        return shape_fitted(fitted(start.model, start.parameters, fit.bound, graduate=False, effort=SEARCH), SEARCH)
     except NoFitError:
         return None
 
@@ -397,7 +403,7 @@ def _exchanged(fit: FittedModel, number: int, group: Sequence[Term]) -> FittedMo
 
 def _refitted(start: FittedModel, like: FittedModel) -> FittedModel | None:
     try:
-        return fitted(start.model, start.parameters, like.bound, graduate=False)
+        return fitted(start.model, start.parameters, like.bound, graduate=False, effort=SEARCH)
     except NoFitError:
         return None
 
@@ -414,6 +420,6 @@ def _held(fit: FittedModel, name: str, how: str) -> FittedModel | None:
 def _reordered(fit: FittedModel, terms: tuple[Term, ...]) -> FittedModel | None:
     model = JointModel(fit.model.prepared, terms, fit.model.near)
     try:
-        return shape_fitted(fitted(model, fit.parameters, fit.bound, graduate=False))
+        return shape_fitted(fitted(model, fit.parameters, fit.bound, graduate=False, effort=SEARCH), SEARCH)
     except NoFitError:
         return None
