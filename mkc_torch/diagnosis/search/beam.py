@@ -39,7 +39,7 @@ MOST_TERMS = 5
 MOST_MODELS = 60
 """Largest number of models of a recording."""
 
-_ADDITIONS = (12, 6, 4, 3, 3, 3)
+_ADDITIONS = (12, 5, 3, 2, 2, 2)
 """Number of effects that are tried in addition to the best model of the beam, the second, and so on."""
 
 LARGER = 1.05
