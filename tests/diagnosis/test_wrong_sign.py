@@ -12,9 +12,17 @@ from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import candidate_terms
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.pipeline.build import is_flexible
 from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.diagnosis.verdict import FitAssessment, Remainder, conclusion_of, decisions_on_all
+from mkc_torch.effects.dynamics.coulomb_friction import CoulombFriction
+from mkc_torch.effects.dynamics.hidden_lag import HiddenLag
+from mkc_torch.effects.dynamics.hidden_mode import HiddenMode
+from mkc_torch.effects.dynamics.input_delay import InputDelay
 from mkc_torch.effects.dynamics.power_law import PowerLaw
+from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
+from mkc_torch.effects.dynamics.sensor_lag import SensorLag
 from mkc_torch.simulation import Dynamics, Parameter
 
 STEP, NOISE = 0.1, 0.01
@@ -68,3 +76,19 @@ def test_a_spring_of_the_wrong_sign_is_not_explained_by_a_power_law(assessed, ra
     found = conclusion_of(Trail(decisions=(named, *on_all)))
     assert (found.verdict, found.doubtful) == (verdict, verdict == "unexplained")
     assert ("check signs and units first" in found.first_advice()) == found.doubtful
+
+
+@pytest.mark.parametrize(
+    ("effect", "flexible"),
+    [
+        (PowerLaw("position"), True),
+        (InputDelay(), True),
+        (SensorLag(), True),
+        (CoulombFriction(), False),
+        (QuadraticDrag(), False),
+        (HiddenMode(), False),
+        (HiddenLag(), False),
+    ],
+)
+def test_general_forms_and_delays_are_flexible_and_a_passive_second_mass_is_not(effect, flexible):
+    assert is_flexible(Term(effect, None, {})) is flexible

@@ -197,12 +197,29 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
     )
     decided = (
         *(decision for _, decisions in graded for decision in decisions),
-        *decisions_on_all(known, left, settings.evidence, findings=bool(findings), flexible=bool(findings)),
+        *decisions_on_all(
+            known,
+            left,
+            settings.evidence,
+            findings=bool(findings),
+            flexible=any(map(is_flexible, final.fit.model.terms)),
+        ),
         *reservations_of(diagnosis),
     )
     trail = Trail(whole.models, decided)
     diagnosis = replace(diagnosis, verdict=verdict_of(trail), decisions=trail)
     return replace(diagnosis, advice=advice_of(diagnosis))
+
+
+def is_flexible(term: Term) -> bool:
+    """Whether an effect can bend even a wrong simulation near to a recording: a curve, a delay or lag, a general form.
+
+    A second mass or store, which is a general form too, is passive: it has an own state and a share of its own, and
+    depends on no component or column by itself. It cannot reverse a sign, and a simulation without it can explain
+    little, as that of a motor with a load on a flexible shaft does.
+    """
+    effect = term.effect
+    return effect.is_curve or effect.remembers or (effect.is_generalisation and bool(effect.plot_axis or term.columns))
 
 
 def _structure(
