@@ -79,8 +79,7 @@ def search_models(
     if options.max_findings == 0 and not options.suspect:
         return replace(search, left=())
     beam = _beam(base, first, terms, options)
-    start = beam.models[()].fit
-    suspected = suspected_models(options.suspect, beam, start, settings.noise, quick=options.quick)
+    suspected = suspected_models(options.suspect, beam, _start(base), settings.noise, quick=options.quick)
     search = replace(search, models=(*trail_of(beam, None), *suspected))
     keep(search)
     if options.max_findings == 0:
@@ -114,12 +113,17 @@ def _screened(
     )
 
 
+def _start(base: ProcessNoiseFit) -> FittedModel:
+    """Return the simulation alone, in open loop if that is found."""
+    return base.fit if base.free is None else base.free
+
+
 def _beam(base: ProcessNoiseFit, first: SearchResult, terms: tuple[Term, ...], options: SearchOptions) -> BeamSearch:
     """Search the models; without a significant candidate, only those with one effect.
 
     Where no finding is wanted, only the simulation alone is scored.
     """
-    start = base.fit if base.free is None else base.free
+    start = _start(base)
     basis = basis_of(base.fit, len({term.key for term in terms}), options.declared, options.settings)
     leaders = [terms[rival.number] for rival in first.ranking[: options.settings.search.own_noise]]
     beam = BeamSearch(terms, basis, options.settings, options.declared)
