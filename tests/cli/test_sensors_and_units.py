@@ -11,7 +11,7 @@ pytest.importorskip("polars")
 
 
 from mkc_torch.calibration.calibrate import Calibration
-from mkc_torch.cli.diagnose import _sensor, _units
+from mkc_torch.cli.simulation_option import checked_sensor, checked_units
 from mkc_torch.cli.units_option import parsed_units
 from mkc_torch.recording.recording import Recording, write_table
 from tests.calibration.test_calibrate import noisy_ellipsoid
@@ -147,11 +147,11 @@ def test_invalid_units_are_refused_with_the_remedy(folder, tmp_path, arguments, 
 def test_unit_and_sensor_options_are_refused_with_a_simulation_of_the_user():
     from typer import BadParameter
 
-    assert _units(["time=us"], None, "pendulum.py:Pendulum") == {"time": "us"}
+    assert checked_units(["time=us"], None, "pendulum.py:Pendulum") == {"time": "us"}
     with pytest.raises(BadParameter, match="apply to a magnetometer"):
-        _units([], "counts", "pendulum.py:Pendulum")
+        checked_units([], "counts", "pendulum.py:Pendulum")
     with pytest.raises(BadParameter, match="--sensor names a magnetometer"):
-        _sensor("mag0", "pendulum.py:Pendulum")
+        checked_sensor("mag0", "pendulum.py:Pendulum")
 
 
 # --- inspect

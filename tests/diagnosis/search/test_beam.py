@@ -1,0 +1,230 @@
+"""The beam search: each set of effects is fitted once in open loop, and the highest score wins."""
+
+import functools
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.score import FAR, basis_of, score
+from mkc_torch.diagnosis.search import beam as beam_module
+from mkc_torch.diagnosis.search.beam import LARGER, BeamSearch, Candidate, called, in_order, model_key
+from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.nonlinear import NoFitError
+from tests.diagnosis.cart import DRAG, FRICTION, NOISE, cart_terms, first_term, fit_with, free_fit
+
+SETTINGS = Settings()
+NAMES = ("quadratic_drag", "coulomb_friction", "constant_force")
+
+
+def beam_of(fit: FittedModel, terms: tuple[Term, ...], **limits: int) -> BeamSearch:
+    basis = basis_of(fit, len({term.key for term in terms}), {}, SETTINGS)
+    return BeamSearch(terms, basis, SETTINGS, {}, **limits)
+
+
+def start(drag: float, friction: float) -> FittedModel:
+    return free_fit(drag, friction, mean=0.0, samples=160)
+
+
+@functools.cache
+def searched(drag: float = 0.0, friction: float = 0.0, names: tuple[str, ...] = NAMES) -> BeamSearch:
+    """Return the search for a few effects in a recording of a cart that reverses."""
+    fit = start(drag, friction)
+    beam = beam_of(fit, cart_terms(fit, *names))
+    beam.run(fit)
+    return beam
+
+
+def effects_of(model: Candidate) -> set[str]:
+    return {term.effect.id for term in model.fit.model.terms}
+
+
+def best_value(beam: BeamSearch, *names: str) -> float:
+    return max(model.value for model in beam.models.values() if effects_of(model) == set(names))
+
+
+def test_two_hidden_effects_are_found_and_score_higher_than_each_alone():
+    beam = searched(DRAG, FRICTION)
+    assert effects_of(beam.best) == {"quadratic_drag", "coulomb_friction"}
+    both = best_value(beam, "quadratic_drag", "coulomb_friction")
+    assert both == beam.best.value
+    assert both > best_value(beam, "quadratic_drag") > best_value(beam)
+    assert both > best_value(beam, "coulomb_friction") > best_value(beam)
+    fit = beam.best.fit
+    sizes = {t.effect.id: float(g) for t, g in zip(fit.model.terms, fit.model.gammas(fit.parameters), strict=True)}
+    assert sizes["quadratic_drag"] == pytest.approx(DRAG, rel=0.1)
+    assert sizes["coulomb_friction"] == pytest.approx(FRICTION, rel=0.1)
+    assert float(fit.residual.std()) == pytest.approx(NOISE, rel=0.2)
+
+
+def test_a_needless_effect_is_not_in_the_best_model():
+    beam = searched(DRAG)
+    assert effects_of(beam.best) == {"quadratic_drag"}
+
+
+def test_without_a_hidden_effect_the_simulation_alone_is_best():
+    assert searched().best.fit.model.terms == ()
+
+
+def test_a_special_case_is_preferred_to_its_general_form():
+    beam = searched(0.0, FRICTION, ("coulomb_friction", "stribeck_friction"))
+    assert effects_of(beam.best) == {"coulomb_friction"}
+    assert best_value(beam, "coulomb_friction") > best_value(beam, "stribeck_friction")
+
+
+def test_every_model_is_fitted_and_scored_once(monkeypatch):
+    scored = []
+
+    def counted(fit, *others):
+        scored.append(model_key(fit.model.terms))
+        return score(fit, *others)
+
+    def refused(*_):
+        raise NoFitError("No noise is fitted here.")
+
+    monkeypatch.setattr(beam_module, "score", counted)
+    monkeypatch.setattr(beam_module, "fit_with_process_noise", refused)
+    fit = start(DRAG, FRICTION)
+    beam = beam_of(fit, cart_terms(fit, *NAMES))
+    beam.run(fit)
+    assert len(beam.models) > 4
+    assert sorted(scored) == sorted(beam.models)
+    assert [model.key for model in beam.models.values()] == list(beam.models)
+
+
+def test_the_moves_lead_from_the_simulation_alone_to_each_model():
+    beam = searched(DRAG, FRICTION)
+    first, *others = beam.models.values()
+    assert (first.key, first.move) == ((), "")
+    assert all(model.move.split()[0] in ("add", "drop", "exchange", "another") for model in others)
+    assert "add coulomb_friction@rate of speed" in {model.move for model in others}
+
+
+def test_the_search_does_not_depend_on_the_order_of_the_candidates():
+    beam = searched(DRAG, FRICTION)
+    fit = start(DRAG, FRICTION)
+    other = beam_of(fit, tuple(reversed(cart_terms(fit, *NAMES))))
+    best = other.run(fit)
+    assert best.key == beam.best.key
+    assert best.value == pytest.approx(beam.best.value, abs=0.01)
+    assert set(other.models) == set(beam.models)
+
+
+@pytest.mark.parametrize("most", [1, 3])
+def test_no_more_models_are_tried_than_allowed(most):
+    fit = start(DRAG, FRICTION)
+    beam = beam_of(fit, cart_terms(fit, *NAMES), most_models=most)
+    beam.run(fit)
+    assert len(beam.models) == most
+
+
+def test_no_model_has_more_effects_than_allowed():
+    fit = start(DRAG, FRICTION)
+    beam = beam_of(fit, cart_terms(fit, *NAMES), most_terms=1)
+    beam.run(fit)
+    assert max(len(model.fit.model.terms) for model in beam.models.values()) == 1
+
+
+@pytest.mark.parametrize(("factor", "scored"), [(0.5, True), (2.0, False)])
+def test_an_implausible_size_has_no_score(factor, scored):
+    """A constant force many times as large as the recording's rates."""
+    alone = start(DRAG, 0.0)
+    model = alone.model.with_term(first_term(alone, "constant_force"))
+    beam = beam_of(alone, cart_terms(alone, *NAMES))
+    size = factor * FAR * float(beam.basis.largest[0])
+    fit = replace(alone, model=model, parameters=torch.cat([alone.parameters, alone.parameters.new_tensor([size])]))
+    candidate = Candidate(fit, score(fit, beam.basis, SETTINGS), "")
+    assert (candidate.score is not None) is scored
+    assert (candidate.value > -float("inf")) is scored
+
+
+def stub(effects, value, residual):
+    terms = tuple(SimpleNamespace(key=(name, (), "rate of speed"), first=False) for name in effects)
+    fit = SimpleNamespace(model=SimpleNamespace(terms=terms), open_loop=SimpleNamespace(residual=residual))
+    return Candidate(fit, SimpleNamespace(value=value), "")
+
+
+def beam_with(*models):
+    return BeamSearch((), None, SETTINGS, {}, {model.key: model for model in models})
+
+
+@pytest.mark.parametrize(("ratio", "larger"), [(0.98 * LARGER, False), (1.02 * LARGER, True)])
+def test_a_model_that_enlarges_the_open_loop_residual_is_not_the_best(ratio, larger):
+    """Most of the residual, and so its robust size, is smaller with the effect; a tenth of the samples grows."""
+    residual = torch.randn(200, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    moved = 0.5 * residual
+    rest = ratio**2 * residual.square().sum() - moved[:180].square().sum()
+    moved[180:] = (rest / 20.0).sqrt()
+    alone, drag = stub((), 0.0, residual), stub(("drag",), 100.0, moved)
+    beam = beam_with(alone, drag)
+    assert beam.enlarges(drag) is larger
+    assert beam.best is (alone if larger else drag)
+    assert not beam.enlarges(alone)
+
+
+def test_a_residual_is_compared_with_those_of_models_with_a_part_of_the_effects():
+    residual = torch.ones(50, 1, dtype=torch.float64)
+    alone, drag = stub((), 0.0, residual), stub(("drag",), 10.0, 0.1 * residual)
+    lag, both = stub(("lag",), 5.0, 0.5 * residual), stub(("drag", "lag"), 20.0, 0.2 * residual)
+    beam = beam_with(alone, drag, lag, both)
+    assert not beam.enlarges(lag)  # drag is not a part of it
+    assert beam.enlarges(both)
+    assert beam.best is drag
+
+
+def test_a_model_that_loses_the_recording_is_not_the_best():
+    alone = stub((), 0.0, torch.ones(50, 1, dtype=torch.float64))
+    lost = stub(("drag",), 50.0, alone.fit.open_loop.residual)
+    lost.fit.open_loop = None
+    assert beam_with(alone, lost).best is alone
+
+
+def test_the_beam_has_the_leading_models_and_those_near_the_best():
+    beam = searched(DRAG, FRICTION)
+    leading = beam.beam()
+    values = [model.value for model in leading]
+    assert values == sorted(values, reverse=True)
+    assert leading[0].value == max(model.value for model in beam.models.values())
+    assert 3 <= len(leading) <= 6
+
+
+def test_another_order_of_the_effects_is_the_same_model():
+    beam = searched(DRAG, FRICTION)
+    best = beam.best
+    terms = best.fit.model.terms
+    other = in_order(best, terms[::-1])
+    assert other.fit.model.terms == terms[::-1]
+    assert other.key == best.key
+    assert other.value == best.value
+    torch.testing.assert_close(other.fit.model.residual(other.fit.parameters), best.fit.residual, rtol=0.0, atol=1e-6)
+    assert in_order(best, terms) is best
+
+
+def test_a_given_set_of_effects_is_fitted_from_the_shapes_of_their_grids():
+    fit = start(DRAG, FRICTION)
+    beam = searched(DRAG, FRICTION)
+    groups = [cart_terms(fit, name) for name in ("coulomb_friction", "quadratic_drag")]
+    model = beam.fitted_set(groups, fit, "suspected")
+    assert model.move == "suspected"
+    assert [term.effect.id for term in model.fit.model.terms] == ["coulomb_friction", "quadratic_drag"]
+    assert model.value == pytest.approx(best_value(beam, "coulomb_friction", "quadratic_drag"), abs=0.5)
+
+
+def test_the_models_without_one_of_the_effects_are_known_afterwards():
+    fit = start(DRAG, FRICTION)
+    beam = beam_of(fit, cart_terms(fit, *NAMES))
+    both = fit_with(fit_with(fit, first_term(fit, "coulomb_friction")), first_term(fit, "quadratic_drag"))
+    model = Candidate(both, score(both, beam.basis, SETTINGS), "")
+    less = beam.with_one_less(model)
+    assert [effects_of(other) for other in less] == [{"quadratic_drag"}, {"coulomb_friction"}]
+    assert all(beam.models[other.key] is other for other in less)
+    again = beam.with_one_less(model)
+    assert all(first is second for first, second in zip(less, again, strict=True))
+
+
+def test_the_trail_names_effects_by_their_place():
+    fit = start(DRAG, 0.0)
+    assert called(first_term(fit, "quadratic_drag")) == "quadratic_drag@rate of speed"
