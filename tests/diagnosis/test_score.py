@@ -44,14 +44,14 @@ class SlowSlide(Slide):
 
 
 @functools.cache
-def slid(seed: int, friction: float = 0.0, push: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
+def slid(seed: int, friction: float = 0.0, jolt: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
     """Times and positions, by semi-implicit steps, with dry friction and white process noise of the speed."""
     rng, fine = np.random.default_rng(seed), 20
     x, v, dt = 1.0, 0.0, STEP / fine
     found = []
     for _ in range(N):
         found.append(x)
-        kick = push * rng.normal() / math.sqrt(fine)
+        kick = jolt * rng.normal() / math.sqrt(fine)
         for _ in range(fine):
             v += dt * (-x - 0.05 * v - friction * math.tanh(v / 0.01)) + kick * dt
             x += dt * v

@@ -291,15 +291,15 @@ class BeamSearch:
         works = [partial(self.under_noise, model) for model in leading]
         self._keep(run_parallel(works, leading[0].fit.model.prepared, self.terms, "model"))
 
-    def under_noise(self, model: Candidate) -> Candidate:
-        """Return a model fitted under its process noise if that scores higher, else the model."""
+    def under_noise(self, model: Candidate, less: float = 0.0) -> Candidate:
+        """Return a model fitted under its process noise, unless that scores lower by more than ``less`` nats."""
         if has_process_noise(model.fit):
             return model
         try:
             noisy = fit_with_process_noise(model.fit, self.declared, self.settings.noise).fit
         except NoFitError:
             return model
-        return self._better(model, noisy)
+        return self._better(model, noisy, less)
 
     def with_best_hold(self, model: Candidate, fixed: Mapping[str, str]) -> Candidate:
         """Return a model with the hold of each input that scores highest; without the effects another may have.
@@ -325,11 +325,11 @@ class BeamSearch:
         whole = fitted(fit.model, fit.parameters, fit.bound, graduate=False)
         return self._better(model, with_profiled_shape(shape_fitted(whole)))
 
-    def _better(self, model: Candidate, fit: FittedModel) -> Candidate:
+    def _better(self, model: Candidate, fit: FittedModel, less: float = 0.0) -> Candidate:
         if fit is model.fit:
             return model
         other = replace(model, fit=fit, score=score(fit, self.basis, self.settings))
-        return other if other.value > model.value else model
+        return other if other.value > model.value - less else model
 
 
 def in_order(model: Candidate, terms: Sequence[Term]) -> Candidate:
@@ -409,7 +409,7 @@ def _refitted(start: FittedModel, like: FittedModel) -> FittedModel | None:
 
 
 def _held(fit: FittedModel, name: str, how: str) -> FittedModel | None:
-    """Return the fit with another hold of an input; its trajectory is searched anew if the fit's own is too far."""
+    """Return the fit with another hold of an input; its trajectory is found again if the fit's own is too far."""
     moved = JointModel(fit.model.prepared.with_input_hold({name: how}), fit.model.terms, fit.model.near)
     try:
         return shape_fitted(fitted(moved, fit.parameters, fit.bound, fresh=True))
