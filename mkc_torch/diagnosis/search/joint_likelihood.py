@@ -18,8 +18,9 @@ from torch import Tensor
 from mkc_torch._support.quantum import rounding_of
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.search.likelihoods import Columns, Limits, LogLikelihoods, log_likelihoods
-from mkc_torch.diagnosis.search.significance import COUNTS, COUNTS_NOT, best_rank_p_value, price
+from mkc_torch.diagnosis.search.likelihoods import PRICE, Columns, Limits, LogLikelihoods, log_likelihoods
+from mkc_torch.diagnosis.search.significance import COUNTS, COUNTS_NOT, best_rank_p_value
+from mkc_torch.diagnosis.search.significance import price as price_of_candidate
 from mkc_torch.diagnosis.search.tangents import ModelTangents
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
 from mkc_torch.simulation.dynamics.kalman import Flow
@@ -122,17 +123,26 @@ class _LinearisedRecording:
     series: SeriesAlong
     columns: Columns
     largest: Float[np.ndarray, " p+m"]
+    price: float
 
     def likelihoods(self, models: Sequence[NoiseModel]) -> LogLikelihoods:
         """Return the recording's log-likelihoods under noise models."""
         return log_likelihoods(
-            self.counted, models, self.series, self.columns, self.largest, "part of the kinds of noise"
+            self.counted,
+            models,
+            self.series,
+            self.columns,
+            self.largest,
+            "part of the kinds of noise",
+            price=self.price,
         )
 
     def with_draws(self, near: LogLikelihoods, draws: SeriesAlong) -> LogLikelihoods:
         """Return the log-likelihoods of the recording and of surrogates under the models of an earlier result."""
         series, thing = joined(self.series, draws), "part of the draws under noise"
-        return log_likelihoods(self.counted, near.models, series, self.columns, self.largest, thing, near.products)
+        return log_likelihoods(
+            self.counted, near.models, series, self.columns, self.largest, thing, near.products, self.price
+        )
 
     def residual(self, number: int | None, model: NoiseModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the whitened recording given a candidate (N, m), the candidate's sizes and the parameters' shift."""
@@ -171,6 +181,7 @@ def joint_likelihood(
     level: float,
     declared: Sequence[bool] = (),
     quick: bool = False,
+    price: float = PRICE,
 ) -> JointLikelihood | None:
     """Search the candidates at a fit of differential equations; None if its trajectory is lost.
 
@@ -184,8 +195,9 @@ def joint_likelihood(
         level: rate of false alarms.
         declared: for each output whether its white noise is declared.
         quick: draw no surrogates; there is an effect if a candidate gains more than its penalty.
+        price: nats that a disturbance has to gain to enter the noise model.
     """
-    scene = _scene(base, terms, tangents, counts)
+    scene = _scene(base, terms, tangents, counts, price)
     if scene is None:
         return None
     prepared = scene.prepared
@@ -211,7 +223,7 @@ def joint_likelihood(
     p_value, beyond, needed = 0.0, np.inf, np.zeros(len(terms))
     if quick:
         samples, tried = int(scene.counted.counts.sum()), len(set(keys))
-        needed = np.array([price(rank, samples, tried) for rank in found.rank])
+        needed = np.array([price_of_candidate(rank, samples, tried) for rank in found.rank])
         p_value = COUNTS if bool((gains > needed).any()) else COUNTS_NOT
     for kind in () if quick else _kinds(found):
         of_kind = _surrogate_test(scene, found, kind, left, draws, generator, level)
@@ -233,7 +245,7 @@ def joint_likelihood(
 
 
 def _scene(
-    base: FittedModel, terms: Sequence[Term], tangents: ModelTangents, counts: Tensor
+    base: FittedModel, terms: Sequence[Term], tangents: ModelTangents, counts: Tensor, price: float
 ) -> _LinearisedRecording | None:
     model, prepared = base.model, base.model.prepared.dynamics
     if prepared is None:
@@ -255,7 +267,7 @@ def _scene(
     )
     theta, changes = base.parameters[: model.base], model.changes(base.parameters)
     largest = plausible_sizes(prepared, theta, changes, model.near)
-    return _LinearisedRecording(prepared, flow, counted, series, columns, largest)
+    return _LinearisedRecording(prepared, flow, counted, series, columns, largest, price)
 
 
 def _limits(base: FittedModel) -> Limits | None:

@@ -17,6 +17,7 @@ import numpy as np
 
 from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch._parallel.pool import shared
+from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel, filter_models
 from mkc_torch.simulation.dynamics.whitening import (
@@ -35,8 +36,8 @@ if TYPE_CHECKING:
 _SINGULAR = 1e-9
 """Share of a candidate's squares, or of their largest eigenvalue, below which a direction counts as absent."""
 
-PRICE = 6.0
-"""Nats that a disturbance has to gain to enter the noise model, as for the baseline."""
+PRICE = NoiseSettings().disturbance_gain
+"""Nats that a disturbance has to gain to enter the noise model, by default."""
 
 _CELLS = 1 << 17
 """Numbers of whitened tangents per block: 1 MB, which fits into a processor's cache."""
@@ -179,6 +180,7 @@ def log_likelihoods(
     largest: Float[np.ndarray, " p+m"] | None = None,
     thing: str = "",
     known: Sequence[Products | None] | None = None,
+    price: float = PRICE,
 ) -> LogLikelihoods:
     """Compute the log-likelihoods; -inf if a disturbance, at its most likely scale, is implausibly large.
 
@@ -190,6 +192,7 @@ def log_likelihoods(
         largest: plausible size of a disturbance of each rate and each output, in their units; None for any.
         thing: name of a part of the noise models in the progress.
         known: products of the tangents under each model, from an earlier result for the same flow and tangents.
+        price: nats that each disturbance has to gain.
     """
     length = -(-len(models) // _PARTS)
     parts = [slice(first, first + length) for first in range(0, len(models), length)]
@@ -197,7 +200,7 @@ def log_likelihoods(
     own, candidates = _split(columns, groups)
     data = joined(series, own), candidates, columns, groups
     works = [
-        partial(_in_this_process, flow, models[part], *data, largest, None if known is None else known[part])
+        partial(_in_this_process, flow, models[part], *data, largest, None if known is None else known[part], price)
         for part in parts
     ]
     return reduce(LogLikelihoods.and_more, shared(works, thing=thing))
@@ -212,6 +215,7 @@ def _in_this_process(
     groups: Sequence[tuple[np.ndarray, np.ndarray]],
     largest: Float[np.ndarray, " p+m"] | None,
     known: Sequence[Products | None] | None,
+    price: float,
 ) -> LogLikelihoods:
     """Compute the log-likelihoods of series that the parameters' tangents follow."""
     B, C, Y = len(models), len(columns.sizes), series.count - columns.parameters
@@ -244,7 +248,7 @@ def _in_this_process(
             continue
         kept[number] = [(gram, norm) for gram, _, norm in products]
         n = len(y) - basis.shape[1]
-        level = -gains.log_spread[place] - log_det - PRICE * len(models[number].components)
+        level = -gains.log_spread[place] - log_det - price * len(models[number].components)
         power = np.square(left).sum(0)
         reach = _reach(models[number], largest)
         least = models[number].least_scale

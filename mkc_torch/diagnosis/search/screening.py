@@ -59,6 +59,7 @@ def screened(
         level=level,
         declared=[name in declared for name in channels],
         quick=quick,
+        price=settings.noise.disturbance_gain,
     )
     if found is None:
         raise NoFitError("The simulation has no finite trajectory at the fitted values.")
