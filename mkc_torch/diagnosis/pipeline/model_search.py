@@ -163,13 +163,24 @@ def _goodness(fit: FittedModel) -> tuple[GoodnessOfFit, ...]:
 
 
 def _in_turn(beam: BeamSearch) -> list[Candidate]:
-    """Return the best model, and behind it the next best with one effect."""
-    usable = [model for model in beam.models.values() if not beam.enlarges(model)]
+    """Return the best model with effects, and behind it the next best with one effect.
+
+    The screening has shown that an effect is missing, so the simulation alone is no rival: any model that is more
+    likely is tested.
+    """
+    alone = beam.models[()].score
+    least = -math.inf if alone is None else alone.log_likelihood
+    usable = [
+        model
+        for model in beam.models.values()
+        if model.fit.model.terms
+        and model.score is not None
+        and model.score.log_likelihood > least
+        and not beam.enlarges(model)
+    ]
     ranked = sorted(usable, key=lambda model: -model.value)
-    alone = beam.models[()].value
-    single = [model for model in ranked if len(model.fit.model.terms) == 1 and model.value > alone]
-    best = [ranked[0]] if ranked[0].fit.model.terms else []
-    return [*best, *[model for model in single if model is not ranked[0]]][:_NEXT]
+    single = [model for model in ranked if len(model.fit.model.terms) == 1]
+    return [*ranked[:1], *[model for model in single if model is not ranked[0]]][:_NEXT]
 
 
 def _tested(
