@@ -44,6 +44,9 @@ effect is in 18 of 28.
 _NEXT = 3
 """Models that are asked in turn if held-out blocks refuse the only effect of the best."""
 
+_KEPT = 0.5
+"""Share of the gain over the simulation alone that a fit under process noise may lose to the open-loop fit."""
+
 _QUICK_MODELS = 8
 """Largest number of models in a quick look."""
 
@@ -252,7 +255,8 @@ def _final(step: Candidate, beam: BeamSearch, options: SearchOptions, *, last: b
     if options.quick:
         return step
     # tests of evidence need residuals that are white under the noise; a lag of a sensor is exact in open loop only
-    less = options.settings.naming.separable * beam.basis.kappa
+    gained = step.value - beam.models[()].value
+    less = max(options.settings.naming.separable * beam.basis.kappa, _KEPT * gained)
     step = beam.under_noise(beam.to_the_end(step), less)
     return beam.with_best_hold(step, options.fixed) if last else step
 
