@@ -72,12 +72,13 @@ def search_models(
         len(fit.residual), math.ceil(correlation), settings.confirmation, first_samples(fit.model.prepared)
     )
     search = StepwiseSearch(None, (), None, blocks, (), terms)
+    ground = fit if base.free is None else base.free
     keep(search)
     if not terms:
-        return replace(search, evidence=(_evidence(search, fit, options),), left=())
+        return replace(search, evidence=(_evidence(search, ground, options),), left=())
     first = _screened(fit, terms, options, generator)
     keep(replace(search, first=first))
-    search = replace(search, first=first, evidence=(_evidence(search, fit, options),))
+    search = replace(search, first=first, evidence=(_evidence(search, ground, options),))
     keep(search)
     if options.max_findings == 0 and not options.suspect:
         return replace(search, left=())
@@ -212,7 +213,8 @@ def _tested(
             after = _evidence(search, step.fit, options)
         except NoFitError as error:
             return replace(search, left=(), given_up=str(error))
-        if number == 0 and options.judged and _refused(search.evidence[0], after, search, options):
+        alike = (base.free is None) == (step.fit.open_loop is None)
+        if number == 0 and options.judged and alike and _refused(search.evidence[0], after, search, options):
             return replace(search, unconfirmed=located)
         pairs = (*search.pairs, (search.evidence[-1], after))
         search = replace(
