@@ -379,7 +379,7 @@ def _refitted(start: FittedModel, like: FittedModel) -> FittedModel | None:
 
 
 def _held(fit: FittedModel, name: str, how: str) -> FittedModel | None:
-    """Return the fit with another hold of an input; its trajectory is searched anew if the fit's own is too far."""
+    """Return the fit with another hold of an input; its trajectory is searched again if the fit's own is too far."""
     moved = JointModel(fit.model.prepared.with_input_hold({name: how}), fit.model.terms, fit.model.near)
     try:
         return shape_fitted(fitted(moved, fit.parameters, fit.bound, fresh=True))
