@@ -22,7 +22,7 @@ from mkc_torch.diagnosis.noise.spectrum import correlation_time
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.score import basis_of
-from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate, called, in_order
+from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate, ModelKey, called, in_order, model_key
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.search.screening import screened
@@ -82,13 +82,13 @@ def search_models(
         follow = _follow(beam) if not options.quick else ()
         trail = _trail(beam, None)
         return replace(search, left=(), first=replace(first, follow=follow), models=trail)
-    search = replace(search, models=_trail(beam, best))
+    search = replace(search, models=_trail(beam, best.key))
     for model in _in_turn(beam):
         found = _tested(search, model, beam, base, options, generator, keep)
         if found.found or not found.unconfirmed:
-            return found
+            return replace(found, models=_trail(beam, _chosen(found)))
         search = replace(search, unconfirmed=search.unconfirmed or found.unconfirmed)
-    return replace(search, left=())
+    return replace(search, left=(), models=_trail(beam, _chosen(search)))
 
 
 def _screened(
@@ -255,9 +255,14 @@ def _follow(beam: BeamSearch) -> tuple[FittedModel, ...]:
     return tuple(named or far)
 
 
-def _trail(beam: BeamSearch, chosen: Candidate | None) -> tuple[ScoredModel, ...]:
+def _chosen(search: StepwiseSearch) -> ModelKey:
+    """Return the identity of the model with the findings."""
+    return model_key(search.found[-1].fit.model.terms if search.found else ())
+
+
+def _trail(beam: BeamSearch, chosen: ModelKey | None) -> tuple[ScoredModel, ...]:
     """Return the scored models for the trail, in the order in which they were tried."""
-    return tuple(_scored(model, chosen=model is chosen) for model in beam.models.values())
+    return tuple(_scored(model, chosen=key == chosen) for key, model in beam.models.items())
 
 
 def _scored(model: Candidate, *, chosen: bool) -> ScoredModel:
