@@ -58,7 +58,7 @@ class ScoreBasis:
         span: (m,), range of each output.
         counts: (N, m), mask of the samples.
         samples: number of samples N, of which half the logarithm is the price of a number.
-        kappa: ratio of the long-run to the short-run variance of the samples' scores, at least 1; it multiplies the price.
+        kappa: ratio of the long-run to the plain variance of the samples' scores, at least 1; it multiplies the price.
         choice: nats for the choice of an effect, the logarithm of the number of candidates.
         rounding: smallest white noise of each output.
         declared: known standard deviations of the outputs' white noise, by output.
