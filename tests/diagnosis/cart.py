@@ -14,7 +14,7 @@ from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics, Parameter
 
 STEP, SAMPLES, FINE, NOISE = 0.05, 240, 50, 0.01
-DRAG, FRICTION = 0.3, 0.4
+DRAG, FRICTION = 0.3, 0.2
 
 
 class Cart(Dynamics):
@@ -33,8 +33,8 @@ def cart_recording(
 ) -> Recording:
     """Return a recording of a cart's speed; without a mean force it reverses, as dry friction needs."""
     clock = [STEP * k for k in range(samples)]
-    force = [mean + math.sin(0.9 * t) + (0.0 if mean else math.sin(2.3 * t)) for t in clock]
-    speed, found = 0.5, []
+    force = [mean + math.sin(0.9 * t) if mean else 1.5 * math.cos(0.9 * t) + math.cos(2.3 * t) for t in clock]
+    speed, found = 0.5 if mean else 0.1, []
     for k in range(samples):
         found.append(speed)
         ahead = force[min(k + 1, samples - 1)]

@@ -146,6 +146,19 @@ def test_a_failed_screening_of_a_further_effect_keeps_the_findings(monkeypatch):
     assert len(search.found) == 1
     assert search.left == ()
     assert search.given_up == "No slope by the gain."
+    assert [len(model.terms) for model in search.models if model.chosen] == [1]
+
+
+def test_the_trail_marks_the_model_with_the_findings_where_blocks_reject_the_best(monkeypatch):
+    """The best has the hidden drag; the next has one of the other effects."""
+    highs = [-0.5, 0.5]
+    monkeypatch.setattr(model_search, "gain_interval", lambda *_: (-1.0, (-2.0, highs.pop(0))))
+    search = searched(baseline(DRAG))
+    (found,) = search.found
+    assert search.unconfirmed is not None
+    assert search.unconfirmed.term.effect.id == "quadratic_drag" != found.term.effect.id
+    (chosen,) = [model for model in search.models if model.chosen]
+    assert chosen.terms == (f"{found.term.effect.id}@{found.term.port}",)
 
 
 @pytest.mark.parametrize(("high", "count"), [(-0.5, 0), (0.5, 1)])
@@ -187,11 +200,14 @@ def test_an_effect_with_which_the_simulation_follows_far_better_is_mentioned():
         assert float(fit.residual.abs().median()) < 1.2 * FAR_LESS * float(base.free.residual.abs().median())
 
 
+FEW = [effect for effect in DYNAMICS if effect.id in (*NAMES, "linear_drag", "input_delay")]
+
+
 def test_process_noise_alone_gives_no_finding():
     fit = pendulum_at_truth("white", 2)
     found = screened(
         fit,
-        candidates(fit, DYNAMICS),
+        candidates(fit, FEW),
         level=0.05,
         surrogates=39,
         generator=torch.Generator().manual_seed(0),
@@ -208,7 +224,7 @@ def test_a_diverging_trajectory_raises(monkeypatch):
     with pytest.raises(NoFitError, match="no finite trajectory"):
         screened(
             fit,
-            candidates(fit, DYNAMICS),
+            candidates(fit, FEW),
             level=0.05,
             surrogates=19,
             generator=torch.Generator(),

@@ -32,7 +32,7 @@ def test_the_hidden_drag_is_the_first_addition_with_its_size():
     gains = [addition.gain for addition in found]
     assert gains == sorted(gains, reverse=True)
     ((_, size),) = found[0].starts
-    assert float(size) > 0.5 * DRAG
+    assert 0.0 < float(size) < DRAG  # the trajectory is far from linear in the drag
     assert float(fit_with(fit, found[0].starts[0][0]).parameters[-1]) == pytest.approx(DRAG, rel=0.02)
 
 
