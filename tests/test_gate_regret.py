@@ -11,6 +11,7 @@ from mkc_torch.cli.diagnosis_request import Request
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.recording.recording import write_table
 from tests.diagnosis import swing
+from tests.gate import __main__ as gate
 from tests.gate import regret, scores
 from tests.gate.known_sets import KNOWN_SETS, KnownSet
 from tests.gate.work import Job, gate_folder, known_jobs
@@ -101,3 +102,19 @@ def test_only_recordings_with_known_sets_have_jobs(tmp_path, monkeypatch):
     monkeypatch.setattr(known, "real", lambda: iter(answers))
     assert [job.name for job in known_jobs(("real",), "", {"real b"})] == ["real b"]
     assert known_jobs(("real",), "other", {"real b"}) == []
+
+
+def test_the_gate_adds_the_regret_to_its_rows(tmp_path, monkeypatch, capsys):
+    for name in ("run.csv", "naive.py"):
+        (tmp_path / name).write_text("", encoding="utf-8")
+    file = f"{tmp_path / 'naive.py'}:Cooling"
+    names = ("real mug run Cooling", "real other")
+    answers = [known.Known(name, tmp_path / "run.csv", file, known.Expected()) for name in names]
+    found = {"verdict": "explained", "findings": [], "residual_after": {}, "cpu_seconds": 2.0}
+    monkeypatch.setattr(known, "real", lambda: iter(answers))
+    monkeypatch.setattr(gate, "diagnosed", lambda jobs, *_, **__: iter([(job.name, dict(found)) for job in jobs]))
+    monkeypatch.setattr(regret, "regrets", lambda _, jobs, *__: {job.name: {"regret": 8.0} for job in jobs})
+    assert gate.main(["--output", str(tmp_path / "out"), "--only", "real", "--regret"]) == 0
+    rows = json.loads((tmp_path / "out" / gate.RESULT).read_text(encoding="utf-8"))["recordings"]
+    assert [row.get("regret") for row in rows.values()] == [8.0, None]
+    assert "above 4.5: real mug run Cooling (8.0)" in capsys.readouterr().out

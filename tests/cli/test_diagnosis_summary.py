@@ -9,6 +9,7 @@ pytest.importorskip("rich")
 from rich.console import Console
 
 from mkc_torch.cli.diagnosis_summary import show
+from mkc_torch.diagnosis.decisions import ScoredModel, Trail
 from mkc_torch.diagnosis.result import EffectParameter, EvidenceResult, Region
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.evidence import SECTIONS, Row, Section
@@ -211,3 +212,11 @@ def test_each_output_has_its_own_unit():
     )
     text = flat(summary_text(make_diagnosis(0, environment=make_environment(goodness_of_fit=followed)), width=200))
     assert "rate: residual 0.0300 rad/s; noise floor 0.0200 rad/s (resolution of the recording)" in text
+
+
+def test_suspected_effects_are_compared_with_the_findings():
+    alone = ScoredModel((), "", 800.0, {}, "white", {"angle": 0.02})
+    lag = ScoredModel(("input_lag@torque",), "suspected", 812.3, {}, "white", {"angle": 0.0139}, suspected=True)
+    text = summary_text(make_diagnosis(0, environment=make_environment(), decisions=Trail((alone, lag))))
+    expected = "The suspected input_lag@torque scores 12.3 nats more than the simulation alone; it leaves 0.0139 rad."
+    assert f"suspected {expected}" in flat(text)
