@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,11 +12,14 @@ import torch
 from mkc_torch.diagnosis.environment import GoodnessOfFit
 from mkc_torch.diagnosis.evidence.held_out import Evidence, blocks_of, gain_interval, held_out, on_all
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, poor_fits, size_of
-from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.process_noise import (
     ProcessNoiseFit,
     first_samples,
+    fit_with_process_noise,
 )
+from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
@@ -224,6 +228,28 @@ def _tested(
         search = replace(search, models=(*trail_of(beam, step.fit), *suspected))
         keep(search)
     return replace(search, left=())
+
+
+def with_step_of(search: StepwiseSearch, base: ProcessNoiseFit, options: SearchOptions) -> StepwiseSearch:
+    """Return the search with its findings fitted again at the step of integration of another fit without effects.
+
+    The p-values are those of the search.
+
+    Raises:
+        NoFitError: a model loses the recording at that step.
+    """
+    prepared = base.fit.model.prepared.open_loop()
+    ground = base.fit if base.free is None else base.free
+    found, evidence = [], [_evidence(search, ground, options)]
+    for located in search.found:
+        model = JointModel(prepared, located.fit.model.terms)
+        fit = shape_fitted(fitted(model, located.fit.parameters, located.fit.bound))
+        if has_process_noise(located.fit):
+            fit = fit_with_process_noise(fit, options.declared, options.settings.noise).fit
+        found.append(replace(located, fit=fit, term=fit.model.terms[-1]))
+        evidence.append(_evidence(search, fit, options))
+    pairs = tuple(itertools.pairwise(evidence))
+    return replace(search, found=tuple(found), evidence=tuple(evidence), pairs=pairs)
 
 
 def _left(fit: FittedModel, beam: BeamSearch) -> tuple[Term, ...]:

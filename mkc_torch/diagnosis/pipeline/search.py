@@ -14,7 +14,7 @@ from mkc_torch.diagnosis.model.process_noise import (
     fit_alone,
 )
 from mkc_torch.diagnosis.pipeline.build import impossible_rotations
-from mkc_torch.diagnosis.pipeline.model_search import search_models
+from mkc_torch.diagnosis.pipeline.model_search import search_models, with_step_of
 from mkc_torch.diagnosis.pipeline.partial import PartialResult
 from mkc_torch.diagnosis.pipeline.prepare import Problem, SearchOptions
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
@@ -60,9 +60,13 @@ def stepwise_search(problem: Problem, known: PartialResult, baseline: ProcessNoi
 
 
 def _at_smaller_step(problem: Problem, known: PartialResult, search: StepwiseSearch) -> StepwiseSearch:
-    """Repeat the whole search with half the step of integration, if the findings depend on the step."""
-    finer = with_smaller_step(search.found[-1].fit, known.options.settings.noise) if search.found else None
-    return search if finer is None else stepwise_search(problem, known, fit_baseline(problem, known, finer))
+    """Halve the step of integration and fit the findings again, as long as they depend on the step."""
+    while search.found:
+        finer = with_smaller_step(search.found[-1].fit, known.options.settings.noise)
+        if finer is None:
+            break
+        search = with_step_of(search, fit_baseline(problem, known, finer), known.options)
+    return search
 
 
 def fit_baseline(problem: Problem, known: PartialResult, prepared: PreparedSimulation | None = None) -> ProcessNoiseFit:
