@@ -18,6 +18,7 @@ from mkc_torch.diagnosis.model.process_noise import (
     ProcessNoiseFit,
     first_samples,
     fit_with_process_noise,
+    has_process_noise,
 )
 from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term
