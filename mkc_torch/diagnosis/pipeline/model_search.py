@@ -10,7 +10,6 @@ from dataclasses import replace
 import torch
 
 from mkc_torch.diagnosis.evidence.held_out import Evidence, blocks_of, gain_interval, held_out, on_all
-from mkc_torch.diagnosis.goodness_of_fit import size_of
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.process_noise import (
@@ -317,8 +316,8 @@ def _follow(beam: BeamSearch) -> tuple[FittedModel, ...]:
     """
     alone = beam.models[()]
     ranked = sorted(beam.models.values(), key=lambda model: -model.value)
-    fits = [model.fit for model in ranked if model.fit.model.terms and model.value > alone.value]
-    free = size_of(alone.fit.residual)
-    far = [fit for fit in fits if float((size_of(fit.residual) / free).log().mean()) < math.log(FAR_LESS)]
+    better = [model for model in ranked if model.fit.model.terms and model.value > alone.value]
+    runs = [model.fit.open_loop for model in better if model.log_size - alone.log_size < math.log(FAR_LESS)]
+    far = [run for run in runs if run is not None]
     named = [fit for fit in far if not fit.model.terms[-1].effect.is_generalisation]
     return tuple(named or far)

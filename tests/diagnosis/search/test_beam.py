@@ -11,7 +11,7 @@ from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.score import FAR, basis_of, score
 from mkc_torch.diagnosis.search import beam as beam_module
-from mkc_torch.diagnosis.search.beam import LARGER, BeamSearch, Candidate, called, in_order, model_key
+from mkc_torch.diagnosis.search.beam import LARGER, BeamSearch, Candidate, in_order, model_key
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
 from tests.diagnosis.cart import DRAG, FRICTION, NOISE, cart_terms, first_term, fit_with, free_fit
@@ -100,7 +100,7 @@ def test_the_moves_lead_from_the_simulation_alone_to_each_model():
     first, *others = beam.models.values()
     assert (first.key, first.move) == ((), "")
     assert all(model.move.split()[0] in ("add", "drop", "exchange", "another") for model in others)
-    assert "add coulomb_friction@rate of speed" in {model.move for model in others}
+    assert "add coulomb_friction@speed" in {model.move for model in others}
 
 
 def test_the_search_does_not_depend_on_the_order_of_the_candidates():
@@ -223,8 +223,3 @@ def test_the_models_without_one_of_the_effects_are_known_afterwards():
     assert all(beam.models[other.key] is other for other in less)
     again = beam.with_one_less(model)
     assert all(first is second for first, second in zip(less, again, strict=True))
-
-
-def test_the_trail_names_effects_by_their_place():
-    fit = start(DRAG, 0.0)
-    assert called(first_term(fit, "quadratic_drag")) == "quadratic_drag@rate of speed"

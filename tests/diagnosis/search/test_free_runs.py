@@ -8,7 +8,8 @@ import torch
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import candidate_terms
-from mkc_torch.diagnosis.search.own_noise import BEHIND_NATS, BEHIND_SHARE, SHAPES, free_runs, linear_gains
+from mkc_torch.diagnosis.search.moves import linear_gains
+from mkc_torch.diagnosis.search.own_noise import BEHIND_NATS, BEHIND_SHARE, SHAPES, free_runs
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.recording import Recording
@@ -70,7 +71,7 @@ def test_missing_drag_leads_with_its_size():
 def test_gains_equal_least_squares_within_the_bounds():
     fit = free_fit(DRAG)
     terms = all_terms(fit)
-    gains, sizes = linear_gains(fit, terms, Settings())
+    gains, sizes = linear_gains(fit, terms, Settings().noise)
     assert len(gains) == len(sizes) == len(terms)
     for term, gain, size in zip(terms, gains, sizes, strict=True):
         assert gain >= 0.0
@@ -92,7 +93,7 @@ def test_gains_equal_least_squares_within_the_bounds():
 def test_drag_of_the_wrong_sign_gains_nothing():
     fit = free_fit(-0.03)
     terms = all_terms(fit)
-    gains, sizes = linear_gains(fit, terms, Settings())
+    gains, sizes = linear_gains(fit, terms, Settings().noise)
     drags = [n for n, term in enumerate(terms) if term.effect.id == "quadratic_drag"]
     assert [gains[n] for n in drags] == [0.0]
     assert [sizes[n].tolist() for n in drags] == [[0.0]]
@@ -120,7 +121,7 @@ def test_each_leading_effect_is_fitted_from_its_best_shapes(monkeypatch):
     fit = free_fit(DRAG)
     terms = all_terms(fit)
     free_runs(fit, terms, Settings())
-    gains = dict(zip(map(id, terms), linear_gains(fit, terms, Settings())[0], strict=True))
+    gains = dict(zip(map(id, terms), linear_gains(fit, terms, Settings().noise)[0], strict=True))
     keys = {term.key for term in tried}
     assert len(keys) == 3
     assert not any(term.effect.is_curve for term in tried)
