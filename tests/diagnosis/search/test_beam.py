@@ -213,7 +213,7 @@ def test_a_given_set_of_effects_is_fitted_from_the_shapes_of_their_grids():
     model = beam.fitted_set(groups, fit, "suspected")
     assert model.move == "suspected"
     assert [term.effect.id for term in model.fit.model.terms] == ["coulomb_friction", "quadratic_drag"]
-    assert model.value == pytest.approx(best_value(beam, "coulomb_friction", "quadratic_drag"), abs=0.5)
+    assert model.value > max(best_value(beam, "coulomb_friction"), best_value(beam, "quadratic_drag"))
 
 
 def test_the_models_without_one_of_the_effects_are_known_afterwards():
