@@ -40,7 +40,7 @@ def found_both() -> StepwiseSearch:
     return searched(baseline(DRAG, FRICTION))
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.e2e) for seed in (1, 2))])
 def test_nothing_is_found_in_a_recording_without_a_hidden_effect(seed):
     search = searched(baseline(seed=seed))
     assert search.found == ()
@@ -60,6 +60,7 @@ def test_a_strong_effect_has_the_smallest_p_value():
     assert [pair[1] for pair in search.pairs] == [search.evidence[1]]
 
 
+@pytest.mark.e2e
 def test_two_effects_are_found_one_after_the_other():
     search = found_both()
     assert {found.term.effect.id for found in search.found} == {"quadratic_drag", "coulomb_friction"}
@@ -70,6 +71,7 @@ def test_two_effects_are_found_one_after_the_other():
     assert len(search.pairs) == 2
 
 
+@pytest.mark.e2e
 def test_rivals_are_ordered_by_their_gaps_and_each_effect_is_one():
     for found in found_both().found:
         terms = found.scene.terms
@@ -82,6 +84,7 @@ def test_rivals_are_ordered_by_their_gaps_and_each_effect_is_one():
         assert len(keys) == len(set(keys))
 
 
+@pytest.mark.e2e
 def test_the_compared_fits_have_the_effects_found_before_and_one_more():
     for number, found in enumerate(found_both().found):
         assert found.compared
@@ -90,6 +93,7 @@ def test_the_compared_fits_have_the_effects_found_before_and_one_more():
         assert found.term.key in {fit.model.terms[-1].key for fit in found.compared}
 
 
+@pytest.mark.e2e
 def test_the_trail_contains_the_chosen_model():
     search = found_both()
     (chosen,) = [model for model in search.models if model.chosen]
@@ -111,6 +115,7 @@ def test_without_findings_allowed_the_candidates_are_screened_only():
     assert (search.found, search.left, search.models) == ((), (), ())
 
 
+@pytest.mark.e2e
 def test_no_more_effects_are_found_than_allowed():
     search = searched(baseline(DRAG, FRICTION), replace(OPTIONS, max_findings=1))
     assert len(search.found) == 1
@@ -122,6 +127,7 @@ def test_without_candidates_there_is_only_evidence_of_the_simulation():
     assert len(search.evidence) == 1
 
 
+@pytest.mark.e2e
 def test_the_search_so_far_is_kept_with_each_finding():
     kept: list[StepwiseSearch] = []
     base = baseline(DRAG, FRICTION)
@@ -132,6 +138,7 @@ def test_the_search_so_far_is_kept_with_each_finding():
     assert all(len(search.evidence) == len(search.found) + 1 for search in kept if search.found)
 
 
+@pytest.mark.e2e
 def test_a_failed_screening_of_a_further_effect_keeps_the_findings(monkeypatch):
     calls = []
 
@@ -167,6 +174,7 @@ def test_errors_of_an_effect_are_raised(monkeypatch):
         searched(baseline(DRAG))
 
 
+@pytest.mark.e2e
 def test_a_quick_look_has_no_surrogates_and_one_finding():
     options = replace(OPTIONS, quick=True, judged=False, max_findings=1)
     search = searched(baseline(DRAG), options)
@@ -191,6 +199,7 @@ def test_an_effect_with_which_the_simulation_follows_far_better_is_mentioned():
 FEW = [effect for effect in DYNAMICS if effect.id in (*NAMES, "linear_drag", "input_delay")]
 
 
+@pytest.mark.e2e
 def test_process_noise_alone_gives_no_finding():
     fit = pendulum_at_truth("white", 2)
     found = screened(

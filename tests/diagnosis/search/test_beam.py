@@ -60,6 +60,7 @@ def test_two_hidden_effects_are_found_and_score_higher_than_each_alone():
     assert float(fit.residual.std()) == pytest.approx(NOISE, rel=0.2)
 
 
+@pytest.mark.e2e
 def test_a_needless_effect_is_not_in_the_best_model():
     beam = searched(DRAG)
     assert effects_of(beam.best) == {"quadratic_drag"}
@@ -69,6 +70,7 @@ def test_without_a_hidden_effect_the_simulation_alone_is_best():
     assert searched().best.fit.model.terms == ()
 
 
+@pytest.mark.e2e
 def test_a_special_case_is_preferred_to_its_general_form():
     beam = searched(0.0, FRICTION, ("coulomb_friction", "stribeck_friction"))
     assert effects_of(beam.best) == {"coulomb_friction"}
@@ -103,6 +105,7 @@ def test_the_moves_lead_from_the_simulation_alone_to_each_model():
     assert "add coulomb_friction@speed" in {model.move for model in others}
 
 
+@pytest.mark.e2e
 def test_the_search_does_not_depend_on_the_order_of_the_candidates():
     beam = searched(DRAG, FRICTION)
     fit = start(DRAG, FRICTION)
@@ -113,17 +116,17 @@ def test_the_search_does_not_depend_on_the_order_of_the_candidates():
     assert set(other.models) == set(beam.models)
 
 
-@pytest.mark.parametrize("most", [1, 3])
+@pytest.mark.parametrize("most", [1, 2])
 def test_no_more_models_are_tried_than_allowed(most):
     fit = start(DRAG, FRICTION)
-    beam = beam_of(fit, cart_terms(fit, *NAMES), most_models=most)
+    beam = beam_of(fit, cart_terms(fit, "quadratic_drag", "constant_force"), most_models=most)
     beam.run(fit)
     assert len(beam.models) == most
 
 
 def test_no_model_has_more_effects_than_allowed():
     fit = start(DRAG, FRICTION)
-    beam = beam_of(fit, cart_terms(fit, *NAMES), most_terms=1)
+    beam = beam_of(fit, cart_terms(fit, "quadratic_drag", "constant_force"), most_terms=1)
     beam.run(fit)
     assert max(len(model.fit.model.terms) for model in beam.models.values()) == 1
 
@@ -210,7 +213,7 @@ def test_a_given_set_of_effects_is_fitted_from_the_shapes_of_their_grids():
     model = beam.fitted_set(groups, fit, "suspected")
     assert model.move == "suspected"
     assert [term.effect.id for term in model.fit.model.terms] == ["coulomb_friction", "quadratic_drag"]
-    assert model.value == pytest.approx(best_value(beam, "coulomb_friction", "quadratic_drag"), abs=0.5)
+    assert model.value > max(best_value(beam, "coulomb_friction"), best_value(beam, "quadratic_drag"))
 
 
 def test_the_models_without_one_of_the_effects_are_known_afterwards():
