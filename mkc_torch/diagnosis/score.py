@@ -1,4 +1,4 @@
-"""The score of a model of differential equations: the comparison of all models of one recording.
+"""The score of a model of differential equations, comparable between all models of one recording.
 
     score = mean over horizons h of sum over samples k of log p(y[k] | y[..k-h]) - price
 
