@@ -155,7 +155,7 @@ def variance_ratio(values: Float[np.ndarray, " N"], reach: int) -> float:
         reach: largest lag, with Bartlett's weights.
 
     Example:
-        >>> variance_ratio(np.array([1.0, -1.0] * 50), 3), variance_ratio(np.repeat([1.0, -1.0] * 25, 4), 3) > 2.0
+        >>> variance_ratio(np.array([1.0, -1.0] * 50), 3), variance_ratio(np.repeat([1.0, -1.0] * 25, 40), 3) > 2.0
         (1.0, True)
     """
     away = values - values.mean()
