@@ -40,6 +40,7 @@ def stepwise_search(problem: Problem, known: PartialResult, baseline: ProcessNoi
     if known.base.model.prepared.dynamics is None:
         return search
     scored = partial(with_scores, search, known.fitted_baseline, known.candidates[1], known.options)
+    problem.progress("scoring the findings")
     search = known.improved("scoring the findings", scored, search)
     known.keep_search(search)
     return search
