@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -119,7 +119,7 @@ def _scored(
         factor[prepared.channels.index(change.column)] = abs(change.factor)
         moved = _in_unit(basis, factor.numpy(), prepared)
     for start in _starts(changed, fits):
-        fit = _tried(lambda start=start: fitted(JointModel(changed), start))  # type: ignore[misc]
+        fit = _fit_from(changed, start)
         found = None if fit is None else score(fit, moved, settings)
         if fit is None or found is None:
             continue
@@ -150,9 +150,9 @@ def _starts(changed: PreparedDynamics, fits: Sequence[FittedModel]) -> Iterator[
         yield start
 
 
-def _tried(work: Callable[[], FittedModel]) -> FittedModel | None:
+def _fit_from(changed: PreparedDynamics, start: torch.Tensor) -> FittedModel | None:
     try:
-        return work()
+        return fitted(JointModel(changed), start)
     except NoFitError:
         return None
 
