@@ -134,7 +134,18 @@ def test_parts_add_up_to_the_score() -> None:
     assert found.terms == pytest.approx(math.log(10))
     dearer = score(friction, replace(basis, kappa=2.0 * basis.kappa), Settings())
     assert dearer is not None
-    assert dearer.value == pytest.approx(found.value - found.numbers)
+    assert dearer.value == pytest.approx(found.value - prices)
+
+
+def test_the_prices_factor_is_1_under_white_noise_and_larger_under_process_noise() -> None:
+    white, noisy = (fits(Slide(), recorded(5, jolt=jolt))[0] for jolt in (0.0, 0.3))
+    assert basis_of(white, 10, {}, Settings()).kappa == 1.0
+    assert basis_of(noisy, 10, {}, Settings()).kappa > 1.5
+
+
+def test_the_last_horizon_is_the_free_run() -> None:
+    basis = basis_of(fits(Slide(), recorded(5))[0], 10, {}, Settings())
+    assert basis.horizons == (1, 4, 16, 256)  # a power of 2 that is longer than the recording
 
 
 def linear_flow(process: float, seed: int) -> Flow:
@@ -177,10 +188,10 @@ def test_an_implausible_size_has_no_score() -> None:
 
 def test_the_variance_ratio_of_overlapping_sums_is_their_length() -> None:
     values = np.random.default_rng(0).normal(size=40_000)
-    assert variance_ratio(values, 16) == pytest.approx(1.0, abs=0.15)
+    assert variance_ratio([values], 16) == pytest.approx(1.0, abs=0.15)
     overlapping = np.convolve(values, np.ones(4), mode="valid")
-    assert variance_ratio(overlapping, 64) == pytest.approx(4.0, rel=0.15)
-    assert variance_ratio(np.ones(10), 3) == 1.0
+    assert variance_ratio([overlapping], 64) == pytest.approx(4.0, rel=0.15)
+    assert variance_ratio([np.ones(10)], 3) == 1.0
 
 
 def test_the_price_of_a_number_is_half_the_logarithm_of_the_samples_times_kappa() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -17,6 +17,7 @@ from mkc_torch.diagnosis.model.process_noise import (
     first_samples,
     fit_with_process_noise,
     has_process_noise,
+    with_noise_around,
 )
 from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term
@@ -26,7 +27,7 @@ from mkc_torch.diagnosis.pipeline.scores import wrong_column
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.pipeline.suspected import suspected_models
 from mkc_torch.diagnosis.pipeline.trail import trail_of
-from mkc_torch.diagnosis.score import basis_of, score
+from mkc_torch.diagnosis.score import basis_of, score, separation
 from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate, in_order
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.run import SearchResult
@@ -46,6 +47,9 @@ effect is in 18 of 28.
 
 _NEXT = 3
 """Models that are asked in turn if held-out blocks refuse the only effect of the best."""
+
+_NAMED = 1.15
+"""Ratio of open-loop residuals up to which named effects are preferred to a curve without a name."""
 
 _KEPT = 0.5
 """Share of the gain over the simulation alone that a fit under process noise may lose to the open-loop fit."""
@@ -97,8 +101,11 @@ def search_models(
     if first.p_value > options.level:
         follow = _follow(beam) if not options.quick else ()
         return replace(search, left=(), first=replace(first, follow=follow))
-    for model in _in_turn(beam):
-        found = _tested(search, model, beam, base, options, generator, keep)
+    for chain in _in_turn(beam):
+        found = _tested(search, chain, beam, base, options, generator, keep)
+        for other in _other_ways(chain, len(found.found), beam):
+            again = _tested(search, other, beam, base, options, generator, keep)
+            found = again if len(again.found) > len(found.found) else found
         if found.found or not found.unconfirmed:
             return found
         search = replace(search, unconfirmed=search.unconfirmed or found.unconfirmed)
@@ -134,6 +141,7 @@ def _beam(base: ProcessNoiseFit, first: SearchResult, terms: tuple[Term, ...], o
     basis = basis_of(base.fit, len({term.key for term in terms}), options.declared, options.settings)
     leaders = [terms[rival.number] for rival in first.ranking[: options.settings.search.own_noise]]
     beam = BeamSearch(terms, basis, options.settings, options.declared)
+    beam.noisy = base.fit if has_process_noise(base.fit) and not options.quick else None
     significant = first.p_value <= options.level
     if options.quick:
         beam.most_models = _QUICK_MODELS
@@ -145,14 +153,16 @@ def _beam(base: ProcessNoiseFit, first: SearchResult, terms: tuple[Term, ...], o
     return beam
 
 
-def _in_turn(beam: BeamSearch) -> list[Candidate]:
-    """Return the best model with effects, and behind it the next best with one effect.
+def _in_turn(beam: BeamSearch) -> list[list[Candidate]]:
+    """Return chains of models to test: that of the simplest good model, and models with one effect.
 
-    The screening has shown that an effect is missing, so the simulation alone is no rival: any model that is more
-    likely is tested.
+    The simplest good model has the lowest price of those that this recording cannot separate from the highest score,
+    and each of its effects raises the score: effects that only gain together have no null in which the first is
+    missing alone. The screening has shown that an effect is missing, so the simulation alone is no rival of models with
+    one effect: those that are more likely are tested if the first chain is refused.
     """
-    alone = beam.models[()].score
-    least = -math.inf if alone is None else alone.log_likelihood
+    alone = beam.models[()]
+    least = -math.inf if alone.score is None else alone.score.log_likelihood
     usable = [
         model
         for model in beam.models.values()
@@ -161,25 +171,49 @@ def _in_turn(beam: BeamSearch) -> list[Candidate]:
         and model.score.log_likelihood > least
         and not beam.enlarges(model)
     ]
-    ranked = sorted(usable, key=lambda model: -model.value)
-    single = [model for model in ranked if len(model.fit.model.terms) == 1]
-    return [*ranked[:1], *[model for model in single if model is not ranked[0]]][:_NEXT]
+    ranked = sorted(_named(usable, alone), key=lambda model: -model.value)
+    single = [[model] for model in ranked if len(model.fit.model.terms) == 1]
+    good = [model for model in ranked if model.value > alone.value]
+    behind = beam.settings.naming.separable * beam.basis.kappa
+    alike = [model for model in good if model.value >= good[0].value - behind]
+    for model in [*sorted(alike, key=lambda model: model.price), *good[len(alike) :]]:
+        chain = _chain(model, beam)
+        if all(later.value > earlier.value for earlier, later in itertools.pairwise([alone, *chain])):
+            return [chain, *[other for other in single if other[0].key != chain[0].key]][:_NEXT]
+    return single[:_NEXT]
+
+
+def _named(models: Sequence[Candidate], alone: Candidate) -> list[Candidate]:
+    """Return the models, without those whose curve follows hardly better than a model of named effects.
+
+    A curve can follow any physics; it is the answer where no effect of the catalogue comes near.
+    """
+    curves = {model.key: any(term.effect.is_curve for term in model.fit.model.terms) for model in models}
+    named = [model for model in models if not curves[model.key] and model.value > alone.value]
+
+    def replaced(model: Candidate) -> bool:
+        return any(
+            len(other.fit.model.terms) <= len(model.fit.model.terms)
+            and other.log_size <= model.log_size + math.log(_NAMED)
+            for other in named
+        )
+
+    return [model for model in models if not (curves[model.key] and replaced(model))]
 
 
 def _tested(
     search: StepwiseSearch,
-    model: Candidate,
+    chain: Sequence[Candidate],
     beam: BeamSearch,
     base: ProcessNoiseFit,
     options: SearchOptions,
     generator: torch.Generator,
     keep: Keep,
 ) -> StepwiseSearch:
-    """Add the effects of a model one after the other as long as each is significant.
+    """Add the effects of a chain of models one after the other as long as each is significant.
 
     The null of each is the model with the effects before it, and all candidates are screened again.
     """
-    chain = _chain(model, beam)
     for number, step in enumerate(chain):
         previous = search.found[-1].fit if search.found else base.fit
         try:
@@ -196,9 +230,8 @@ def _tested(
         if number == 0 and options.judged and alike and _refused(search.evidence[0], after, search, options):
             return replace(search, unconfirmed=located)
         pairs = (*search.pairs, (search.evidence[-1], after))
-        search = replace(
-            search, found=(*search.found, located), evidence=(*search.evidence, after), pairs=pairs, left=()
-        )
+        evidence = (*search.evidence, after)
+        search = replace(search, found=(*search.found, located), evidence=evidence, pairs=pairs, left=())
         suspected = (model for model in search.models if model.suspected)
         search = replace(search, models=(*trail_of(beam, step.fit), *suspected))
         keep(search)
@@ -241,11 +274,30 @@ def _chain(model: Candidate, beam: BeamSearch) -> list[Candidate]:
         if not less:
             break
         chain.insert(0, max(less, key=lambda candidate: candidate.value))
-    # the terms of each model in the order in which they enter
-    for number in range(1, len(chain)):
-        ordered = [*chain[number - 1].fit.model.terms, *_missing(chain[number], chain[number - 1])]
-        chain[number] = in_order(chain[number], ordered)
-    return chain
+    return _in_orders_of(chain)
+
+
+def _in_orders_of(chain: Sequence[Candidate]) -> list[Candidate]:
+    """Return a chain with the effects of each model in the order in which they enter."""
+    ordered = [chain[0]]
+    for model in chain[1:]:
+        before = ordered[-1]
+        ordered.append(in_order(model, [*before.fit.model.terms, *_missing(model, before)]))
+    return ordered
+
+
+def _other_ways(chain: Sequence[Candidate], reached: int, beam: BeamSearch) -> list[list[Candidate]]:
+    """Return chains that end a step behind the effects that were found, and reach it through other effects.
+
+    A linear screening may not see an effect while another is missing: a second vessel that fills only once the first
+    overflows.
+    """
+    if not 0 < reached < len(chain):
+        return []
+    last = {term.key for term in _missing(chain[reached], chain[reached - 1])}
+    ways = [less for less in beam.with_one_less(chain[reached]) if last & {term.key for term in less.fit.model.terms}]
+    ways.sort(key=lambda model: -model.value)
+    return [_in_orders_of([*_chain(way, beam), chain[reached]]) for way in ways[:1]]
 
 
 def _missing(model: Candidate, smaller: Candidate) -> list[Term]:
@@ -260,8 +312,12 @@ def _final(step: Candidate, beam: BeamSearch, options: SearchOptions, *, last: b
     # tests of evidence need residuals that are white under the noise; a lag of a sensor is exact in open loop only
     gained = step.value - beam.models[()].value
     less = max(options.settings.naming.separable * beam.basis.kappa, _KEPT * gained)
-    step = beam.under_noise(beam.to_the_end(step), less)
-    return beam.with_best_hold(step, options.fixed) if last else step
+    whole = beam.simplified(beam.to_the_end(step))
+    whole = beam.with_best_hold(whole, options.fixed) if last else whole
+    noisy = beam.under_noise(whole, less)
+    if noisy is not whole or has_process_noise(whole.fit):
+        return noisy
+    return replace(whole, fit=with_noise_around(whole.fit, options.declared, options.settings.noise))
 
 
 def _as_result(located: SearchResult, step: Candidate, beam: BeamSearch) -> SearchResult:
@@ -271,13 +327,12 @@ def _as_result(located: SearchResult, step: Candidate, beam: BeamSearch) -> Sear
     terms = located.scene.terms
     others = {term.key for term in fit.model.terms[:-1]}
     rivals: dict[Key, Candidate] = {}
-    for model in beam.models.values():
+    for model in _named(list(beam.models.values()), beam.models[()]):
         more = [term.key for term in model.fit.model.terms if term.key not in others]
         if len(model.fit.model.terms) == len(others) + 1 and len(more) == 1:
             known = rivals.get(more[0])
             rivals[more[0]] = model if known is None or model.value > known.value else known
-    # the score's nats are correlated by this ratio, the limits of separability are not
-    gaps = {key: (step.value - model.value) / beam.basis.kappa for key, model in rivals.items()}
+    gaps = {key: separation(step.score, model.score, beam.basis) for key, model in rivals.items()}
     gaps[own.key] = 0.0
     last = max([gap for gap in gaps.values() if math.isfinite(gap)], default=0.0)
     ranking = []

@@ -9,15 +9,30 @@ from functools import cached_property, partial
 
 import torch
 
-from mkc_torch.diagnosis.model.fit import ROUGH, SEARCH, FittedModel, fitted, fitted_with_effect, without_term
+from mkc_torch.diagnosis.model.fit import (
+    SEARCH,
+    FittedModel,
+    fitted,
+    fitted_with_effect,
+)
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise, has_process_noise
-from mkc_torch.diagnosis.model.shapes import shape_fitted, with_form_of_grid, with_profiled_shape
+from mkc_torch.diagnosis.model.shapes import shape_fitted, with_profiled_shape
 from mkc_torch.diagnosis.model.suspect import suspect_id
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
 from mkc_torch.diagnosis.score import Score, ScoreBasis, score
+from mkc_torch.diagnosis.search.move_fits import (
+    POLISHED,
+    at_initial_values,
+    fitted_exchanged,
+    fitted_held,
+    fitted_reordered,
+    fitted_simpler,
+    fitted_through_noise,
+    fitted_with,
+    fitted_without,
+)
 from mkc_torch.diagnosis.search.moves import (
-    STARTS,
     Addition,
     additions,
     in_other_orders,
@@ -42,15 +57,15 @@ MOST_MODELS = 60
 _ADDITIONS = (12, 5, 3, 2, 2, 2)
 """Number of effects that are tried in addition to the best model of the beam, the second, and so on."""
 
+_TWINS = (2, 1, 0)
+"""Number of these that repeat an effect of the model at another place, whatever their linear gain."""
+
 LARGER = 1.05
 """Ratio of open-loop residuals with and without an effect above which it enlarges the residual: the ratio at which
 held-out blocks reject a finding."""
 
 _PAYS = 0.5
 """Share of its price that an addition to a model with effects has to gain in the linearised model."""
-
-_POLISHED = 2
-"""Rough fits of an effect that are refined to the end."""
 
 _NOISY = 3
 """Number of leading models that are also fitted under their process noise."""
@@ -77,6 +92,11 @@ class Candidate:
     def value(self) -> float:
         """The score in nats."""
         return -float("inf") if self.score is None else self.score.value
+
+    @property
+    def price(self) -> float:
+        """The price of the model's numbers, effects and noise in nats."""
+        return float("inf") if self.score is None else self.score.log_likelihood - self.score.value
 
     @property
     def key(self) -> ModelKey:
@@ -109,6 +129,7 @@ class BeamSearch:
         models: the scored models by identity, in the order in which they were tried.
         most_terms: largest number of effects of a model.
         most_models: largest number of models that the search tries.
+        noisy: the simulation alone under its process noise; None without.
     """
 
     terms: tuple[Term, ...]
@@ -118,16 +139,14 @@ class BeamSearch:
     models: dict[ModelKey, Candidate] = field(default_factory=dict)
     most_terms: int = MOST_TERMS
     most_models: int = MOST_MODELS
+    noisy: FittedModel | None = None
 
-    def run(
-        self, start: FittedModel, further: Sequence[Term] = (), progress: Callable[[int], object] = lambda _: None
-    ) -> Candidate:
+    def run(self, start: FittedModel, further: Sequence[Term] = ()) -> Candidate:
         """Search from the simulation alone; return the model with the highest score.
 
         Args:
             start: the simulation alone, in open loop if that is found.
             further: candidates that are tried first, such as the leaders of another screening.
-            progress: called with the number of models after each round.
         """
         self._keep([Candidate(start, score(start, self.basis, self.settings), "")])
         terms = with_wide_grid(self.terms, start.model.prepared)
@@ -139,7 +158,6 @@ class BeamSearch:
             for rank, model in waiting:
                 expanded.add(model.key)
                 self._expand(model, rank, terms, further)
-            progress(len(self.models))
         self._under_noise()
         return self.best
 
@@ -189,7 +207,7 @@ class BeamSearch:
         found = [model for model in run_parallel(works, prepared, self.terms, "model") if model is not None]
         best = max(found, key=lambda model: model.value)
         if thorough:
-            others = [partial(_reordered, best.fit, order) for order in in_other_orders(best.fit)]
+            others = [partial(fitted_reordered, best.fit, order) for order in in_other_orders(best.fit)]
             works = [partial(self._scored, move, other) for other in others]
             found = [model for model in run_parallel(works, prepared, self.terms, "model") if model is not None]
             best = max([best, *found], key=lambda model: model.value)
@@ -202,7 +220,7 @@ class BeamSearch:
         for group in groups:
             wide = with_wide_grid(group, fit.model.prepared) or tuple(group)
             [addition] = additions(fit, wide, self.settings.noise)[:1]
-            fit = _with(fit, addition)
+            fit = fitted_with(fit, addition)
         return fit
 
     def _expand(self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term]) -> None:
@@ -210,20 +228,46 @@ class BeamSearch:
         fit, have = model.fit, len(model.fit.model.terms)
         works: list[tuple[ModelKey, str, Callable[[], FittedModel | None]]] = []
         if have < self.most_terms and not any(term.effect.is_curve for term in fit.model.terms):
+            others = self._other_starts(fit, terms, further) if not have else {}
             for addition in self._chosen(additions(fit, terms, self.settings.noise), model, rank, further):
                 key = model_key([*fit.model.terms, addition.starts[0][0]])
-                works.append((key, f"add {self._id(addition.starts[0][0])}", partial(_with, fit, addition)))
+                work = partial(fitted_with, fit, addition, others.get(addition.key, ()))
+                works.append((key, f"add {self._id(addition.starts[0][0])}", work))
         for number, term in enumerate(fit.model.terms):
             if have > 1:
                 rest = [other for other in fit.model.terms if other is not term]
-                works.append((model_key(rest), f"drop {self._id(term)}", partial(_without, fit, number)))
+                works.append((model_key(rest), f"drop {self._id(term)}", partial(fitted_without, fit, number)))
             for other in special_cases(term, self.terms, fit.model.prepared):
                 rest = [*fit.model.terms[:number], *fit.model.terms[number + 1 :], other]
                 move = f"exchange {self._id(term)} for {self._id(other)}"
-                works.append((model_key(rest), move, partial(_exchanged, fit, number, self._all(other))))
+                works.append((model_key(rest), move, partial(fitted_exchanged, fit, number, self._all(other))))
         orders = in_other_orders(fit)
-        works += [(model_key(o), "another order in series", partial(_reordered, fit, o)) for o in orders]
+        works += [(model_key(o), "another order in series", partial(fitted_reordered, fit, o)) for o in orders]
         self._fit(works, fit, self.most_models)
+
+    def _other_starts(
+        self, fit: FittedModel, terms: Sequence[Term], further: Sequence[Term]
+    ) -> dict[Key, list[Callable[[], FittedModel | None]]]:
+        """Return fits of each effect from elsewhere than the simulation alone in open loop.
+
+        From its initial values, if the fit went far from them; and through the process noise of the simulation alone,
+        along whose trajectory a strong effect can be fitted that the open loop does not reach. The latter is slow, and
+        is for the candidates that the screening found there.
+        """
+        found: dict[Key, list[Callable[[], FittedModel | None]]] = {}
+        there, noisy = at_initial_values(fit, self.settings.search.ran_away), self.noisy
+        if there is not None:
+            for addition in additions(there, terms, self.settings.noise):
+                for term, size in addition.starts[:POLISHED]:
+                    start = torch.cat([there.parameters, size])
+                    work = partial(fitted_with_effect, fit, fit.model.with_term(term), start, effort=SEARCH)
+                    found.setdefault(addition.key, []).append(work)
+        if noisy is not None:
+            leading = {term.key for term in further}
+            led = [term for term in terms if term.key in leading]
+            for addition in additions(noisy, led, self.settings.noise):
+                found.setdefault(addition.key, []).append(partial(fitted_through_noise, noisy, *addition.starts[0]))
+        return found
 
     def with_one_less(self, model: Candidate) -> list[Candidate]:
         """Return the models without one of a model's effects, fitted if they are not known."""
@@ -232,7 +276,7 @@ class BeamSearch:
             (model_key([other for other in fit.model.terms if other is not term]), number, term)
             for number, term in enumerate(fit.model.terms)
         ]
-        works = [(key, f"drop {self._id(term)}", partial(_without, fit, number)) for key, number, term in rests]
+        works = [(key, f"drop {self._id(term)}", partial(fitted_without, fit, number)) for key, number, term in rests]
         self._fit(works, fit, len(self.models) + len(works))
         return [self.models[key] for key, _, _ in rests if key in self.models]
 
@@ -247,17 +291,22 @@ class BeamSearch:
         most = _ADDITIONS[min(rank, len(_ADDITIONS) - 1)]
         ranked = sorted(found, key=value, reverse=True)
         if model.fit.model.terms:
+            own = {term.effect.id for term in model.fit.model.terms}
+            # an effect at two places, as two vessels that overflow, may show only with both
+            twins = [a for a in ranked if a.starts[0][0].effect.id in own][: _TWINS[min(rank, len(_TWINS) - 1)]]
             ranked = [a for a in ranked if a.gain >= _PAYS * self._price(a.starts[0][0], a.starts[0][1])]
-            return ranked[:most]
+            return list({a.key: a for a in [*ranked[:most], *twins]}.values())
         first = [addition for term in further for addition in found if addition.key == term.key]
         first = list({addition.key: addition for addition in first}.values())
         others = [addition for addition in ranked if addition.key not in {a.key for a in first}]
         return [*first, *others[: max(most - len(first), most // 2)]]
 
     def _price(self, term: Term, size: torch.Tensor) -> float:
+        """Return the price of an effect next to a linear gain, a likelihood of one horizon."""
         naming = self.settings.naming
         form = naming.is_generalisation * term.effect.is_generalisation + naming.nameless * term.effect.is_curve
-        return self.basis.number * (len(size) + len(term.effect.fitted_shape)) + self.basis.choice + form
+        numbers = len(size) + len(term.effect.fitted_shape)
+        return self.basis.number / self.basis.kappa * numbers + self.basis.choice + form
 
     def _id(self, term: Term) -> str:
         return suspect_id(term, self.terms)
@@ -296,7 +345,7 @@ class BeamSearch:
         if has_process_noise(model.fit):
             return model
         try:
-            noisy = fit_with_process_noise(model.fit, self.declared, self.settings.noise).fit
+            noisy = shape_fitted(fit_with_process_noise(model.fit, self.declared, self.settings.noise).fit)
         except NoFitError:
             return model
         return self._better(model, noisy, less)
@@ -311,8 +360,19 @@ class BeamSearch:
         for name, how in model.fit.model.prepared.input_hold.items():
             for other in ("held", "linear"):
                 if name not in fixed and other != how:
-                    held = _held(model.fit, name, other)
+                    held = fitted_held(model.fit, name, other)
                     model = model if held is None else self._better(model, held)
+        return model
+
+    def simplified(self, model: Candidate) -> Candidate:
+        """Return a model with the simpler forms of its effects that this recording cannot separate from it."""
+        for number in range(len(model.fit.model.terms)):
+            other = fitted_simpler(model.fit, number)
+            model = (
+                model
+                if other is None
+                else self._better(model, other, self.settings.naming.separable * self.basis.kappa)
+            )
         return model
 
     def to_the_end(self, model: Candidate) -> Candidate:
@@ -352,74 +412,3 @@ def in_order(model: Candidate, terms: Sequence[Term]) -> Candidate:
 
 def _place_of(term: Term, groups: Sequence[Sequence[Term]]) -> int:
     return next(number for number, group in enumerate(groups) if term.key in {other.key for other in group})
-
-
-def _best(fits: Sequence[FittedModel]) -> FittedModel:
-    return max(fits, key=lambda fit: fit.log_likelihood)
-
-
-def _with(fit: FittedModel, addition: Addition) -> FittedModel:
-    """Return the fit with one more effect, from its best shapes."""
-    begun = sorted((_begun(fit, term, size) for term, size in addition.starts), key=lambda found: -found.log_likelihood)
-    least = 0.5 * (begun[0].log_likelihood + fit.log_likelihood)
-    near = [found for number, found in enumerate(begun[:_POLISHED]) if number == 0 or found.log_likelihood >= least]
-    return with_form_of_grid(_best([_polished(found) for found in near]), SEARCH)
-
-
-def _polished(begun: FittedModel) -> FittedModel:
-    """Return a rough fit at the most likely sizes and shapes."""
-    if begun.model.terms[-1].effect.fitted_shape:
-        return shape_fitted(begun, SEARCH)
-    found = _refitted(begun, begun)
-    return begun if found is None else found
-
-
-def _begun(fit: FittedModel, term: Term, size: torch.Tensor) -> FittedModel:
-    """Return a rough fit with one more effect at a fixed shape: from its linear size, or from 0 if that is worse."""
-    model = fit.model.with_term(term)
-    found = fitted_with_effect(fit, model, torch.cat([fit.parameters, size]), graduate=False, effort=ROUGH)
-    if found.log_likelihood > fit.log_likelihood:
-        return found
-    zero = torch.cat([fit.parameters, torch.zeros_like(size)])
-    return _best([found, fitted_with_effect(fit, model, zero, graduate=False, effort=ROUGH)])
-
-
-def _without(fit: FittedModel, number: int) -> FittedModel | None:
-    start = without_term(fit, number)
-    try:
-        return shape_fitted(fitted(start.model, start.parameters, fit.bound, graduate=False, effort=SEARCH), SEARCH)
-    except NoFitError:
-        return None
-
-
-def _exchanged(fit: FittedModel, number: int, group: Sequence[Term]) -> FittedModel | None:
-    """Return the fit with another effect in place of one, from all shapes of its grid."""
-    rest = _without(fit, number) if len(fit.model.terms) > 1 else _refitted(without_term(fit, number), fit)
-    if rest is None:
-        return None
-    zero = rest.parameters.new_zeros(rest.model.with_term(group[0]).size - rest.model.size)
-    return _with(rest, Addition(tuple((term, zero) for term in group[:STARTS]), 0.0))
-
-
-def _refitted(start: FittedModel, like: FittedModel) -> FittedModel | None:
-    try:
-        return fitted(start.model, start.parameters, like.bound, graduate=False, effort=SEARCH)
-    except NoFitError:
-        return None
-
-
-def _held(fit: FittedModel, name: str, how: str) -> FittedModel | None:
-    """Return the fit with another hold of an input; its trajectory is found again if the fit's own is too far."""
-    moved = JointModel(fit.model.prepared.with_input_hold({name: how}), fit.model.terms, fit.model.near)
-    try:
-        return shape_fitted(fitted(moved, fit.parameters, fit.bound, fresh=True))
-    except NoFitError:
-        return None
-
-
-def _reordered(fit: FittedModel, terms: tuple[Term, ...]) -> FittedModel | None:
-    model = JointModel(fit.model.prepared, terms, fit.model.near)
-    try:
-        return shape_fitted(fitted(model, fit.parameters, fit.bound, graduate=False, effort=SEARCH), SEARCH)
-    except NoFitError:
-        return None
