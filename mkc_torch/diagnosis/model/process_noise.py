@@ -368,23 +368,28 @@ def _from_given(
 
 
 def choose_input_hold(
-    base: ProcessNoiseFit, declared: Mapping[str, float], fixed: Mapping[str, str], settings: NoiseSettings
+    base: ProcessNoiseFit,
+    declared: Mapping[str, float],
+    fixed: Mapping[str, str],
+    settings: NoiseSettings,
+    value: Callable[[ProcessNoiseFit], float],
 ) -> ProcessNoiseFit:
-    """Return the fit with the most likely hold of each input, constant or linear between samples.
+    """Return the fit with the best hold of each input, constant or linear between samples.
 
     Args:
         base: the fit with the simulation's own holds.
         declared: known standard deviations of the outputs' white noise.
         fixed: inputs whose hold is known.
         settings: of the noise.
+        value: the score of a fit.
     """
     prepared = base.fit.model.prepared.open_loop()
     for name, how in prepared.input_hold.items():
         others = [hold for hold in ("held", "linear") if hold != how] if name not in fixed else []
         works = [partial(_holding, base, name, other, declared, settings) for other in others]
         tried = [found for found in run_parallel(works, prepared) if found is not None]
-        least = settings.disturbance_gain
-        base = max([base, *tried], key=lambda fits: fits.fit.log_likelihood - least * fits.disturbance_count)
+        if tried:
+            base = max([base, *tried], key=value)
     return _with_sizes(base)
 
 
