@@ -5,7 +5,8 @@
 A prediction is normal or, with a probability of 5 %, uniform over the output's span. Every density sums to 1 and the
 weights of the horizons do too, so the score is proper: in expectation no model scores higher than the true one. With
 white sensor noise alone all horizons are the free run, and the score is the ordinary log-likelihood. Process noise of
-any size can follow a recording one sample ahead; further ahead it has to pay with wide predictions.
+any size can follow a recording one sample ahead; further ahead it has to pay with wide predictions. The last horizon is
+the free run: what a user compares with the recording.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from mkc_torch.diagnosis.goodness_of_fit import size_of
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
+from mkc_torch.simulation.dynamics.draws import drawn
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
 from mkc_torch.simulation.dynamics.horizons import horizons_of, log_likelihood_ahead, per_sample
 from mkc_torch.simulation.dynamics.kalman import Flow
@@ -42,6 +44,9 @@ _ROUNDS = 3
 _SETTLED = 0.05
 """Nats that a step has to gain for another."""
 
+_DRAWS = 8
+"""Recordings drawn for the variance ratio."""
+
 FAR = 10.0
 """Multiple of the recording's largest rate above which an effect is implausible."""
 
@@ -59,6 +64,7 @@ class ScoreBasis:
         counts: (N, m), mask of the samples.
         samples: number of samples N, of which half the logarithm is the price of a number.
         kappa: long-run variance of the samples' scores over that of independent samples, at least 1; multiplies prices.
+            Of recordings drawn with the noise of the simulation alone.
         choice: nats for the choice of an effect, the logarithm of the number of candidates.
         rounding: smallest white noise of each output.
         declared: known standard deviations of the outputs' white noise, by output.
@@ -140,31 +146,49 @@ def basis_of(base: FittedModel, candidates: int, declared: Mapping[str, float], 
     theta, changes = base.parameters[: base.model.base], base.model.changes(base.parameters)
     largest = plausible_sizes(prepared, theta, changes, base.model.near)
     basis = ScoreBasis(horizons_of(flow), span, counts, len(counts), 1.0, choice, rounding, declared, largest)
-    alone = score(base, basis, settings)
-    return basis if alone is None else replace(basis, kappa=variance_ratio(alone.per_sample, basis.horizons[-1]))
+    fits = [fit for fit in (base, base.open_loop) if fit is not None]
+    scored = [(fit, found) for fit in fits if (found := score(fit, basis, settings)) is not None]
+    if not scored:
+        return basis
+    fit, alone = max(scored, key=lambda pair: pair[1].value)
+    return replace(basis, kappa=_kappa(fit, alone.noise, basis))
 
 
-def variance_ratio(values: Float[np.ndarray, " N"], reach: int) -> float:
-    """Return the long-run variance over the variance of a series, at least 1.
+def _kappa(fit: FittedModel, noise: NoiseModel, basis: ScoreBasis) -> float:
+    """Return the variance ratio of recordings drawn with the noise of a fit, whose residual may hold missing physics.
+
+    The free run is left out: with process noise its errors are a single path, in which a number gains little.
+    """
+    flow = _flow(fit)
+    if flow is None or not noise.components:
+        return 1.0  # all horizons are the free run, and its errors are independent
+    generator, horizons = np.random.default_rng(0), basis.horizons[:-1] or basis.horizons
+    flow = replace(flow, counts=basis.counts, shift=np.zeros_like(flow.shift))
+    draws = [replace(flow, new=new) for new in drawn(flow, noise, _DRAWS, generator)]
+    return variance_ratio([per_sample(draw, noise, horizons, basis.span) for draw in draws], horizons[-1])
+
+
+def variance_ratio(series: Sequence[Float[np.ndarray, " N"]], reach: int) -> float:
+    """Return the long-run variance over the variance of several series of a kind, at least 1.
 
     Predictions over h samples overlap by h - 1, so their errors are correlated up to there. Newey & West, Econometrica
     55 (1987), 703.
 
     Args:
-        values: the series.
+        series: the series, each with a mean of its own.
         reach: largest lag, with Bartlett's weights.
 
     Example:
-        >>> variance_ratio(np.array([1.0, -1.0] * 50), 3), variance_ratio(np.repeat([1.0, -1.0] * 25, 40), 3) > 2.0
+        >>> variance_ratio([np.array([1.0, -1.0] * 50)], 3), variance_ratio([np.repeat([1.0, -1.0] * 25, 40)], 3) > 2.0
         (1.0, True)
     """
-    away = values - values.mean()
-    power = float(away @ away)
-    if not power > 0.0:
-        return 1.0
-    lags = range(1, min(reach, len(away) - 1) + 1)
-    total = sum((1.0 - lag / (reach + 1)) * float(away[lag:] @ away[:-lag]) for lag in lags)
-    return max(1.0 + 2.0 * total / power, 1.0)
+    power = total = 0.0
+    for values in series:
+        away = values - values.mean()
+        power += float(away @ away)
+        lags = range(1, min(reach, len(away) - 1) + 1)
+        total += sum((1.0 - lag / (reach + 1)) * float(away[lag:] @ away[:-lag]) for lag in lags)
+    return max(1.0 + 2.0 * total / power, 1.0) if power > 0.0 else 1.0
 
 
 def score(fit: FittedModel, basis: ScoreBasis, settings: Settings, near: Sequence[NoiseModel] = ()) -> Score | None:

@@ -177,10 +177,10 @@ def test_an_implausible_size_has_no_score() -> None:
 
 def test_the_variance_ratio_of_overlapping_sums_is_their_length() -> None:
     values = np.random.default_rng(0).normal(size=40_000)
-    assert variance_ratio(values, 16) == pytest.approx(1.0, abs=0.15)
+    assert variance_ratio([values], 16) == pytest.approx(1.0, abs=0.15)
     overlapping = np.convolve(values, np.ones(4), mode="valid")
-    assert variance_ratio(overlapping, 64) == pytest.approx(4.0, rel=0.15)
-    assert variance_ratio(np.ones(10), 3) == 1.0
+    assert variance_ratio([overlapping], 64) == pytest.approx(4.0, rel=0.15)
+    assert variance_ratio([np.ones(10)], 3) == 1.0
 
 
 def test_the_price_of_a_number_is_half_the_logarithm_of_the_samples_times_kappa() -> None:

@@ -31,13 +31,14 @@ _CELLS = 1 << 22
 
 
 def horizons_of(flow: Flow) -> tuple[int, ...]:
-    """The horizons 1, 4, 16, … in samples, up to a tenth of the shortest run."""
+    """The horizons 1, 4, 16, … in samples, up to a tenth of the shortest run, and last the free run of the longest."""
     ends = np.flatnonzero(np.concatenate([flow.step <= 0, [True]]))
-    most = int(np.diff(np.concatenate([[-1], ends])).min()) // _LONGEST
+    lengths = np.diff(np.concatenate([[-1], ends]))
     found = [1]
-    while found[-1] * _RATIO <= most:
+    while found[-1] * _RATIO <= int(lengths.min()) // _LONGEST:
         found.append(found[-1] * _RATIO)
-    return tuple(found)
+    free = 1 << (int(lengths.max()) - 1).bit_length()  # predictions are composed by doubling
+    return (*found, free) if free > found[-1] else tuple(found)
 
 
 def log_likelihood_ahead(
@@ -123,7 +124,7 @@ def _ahead(flow: Flow, models: FilterModels, horizons: Sequence[int]) -> Innovat
     covariance = np.ascontiguousarray(found.posterior[:, 0].transpose(2, 3, 1, 0))
     standard, log_spread = [], []
     for carry, noise, shift, horizon in _composed(flow, models, horizons):
-        behind = slice(0, len(flow.new) - horizon)
+        behind = slice(0, max(len(flow.new) - horizon, 0))
         state, spread = shift.copy(), noise.copy()
         state[..., horizon:] += _times_vector(carry[..., horizon:], mean[..., behind])
         moved = _times(carry[..., horizon:], covariance[..., behind])
@@ -162,7 +163,7 @@ def _composed(
             yield carry, noise, shift, horizon
         if horizon >= horizons[-1]:
             return
-        behind, ahead = slice(0, N - horizon), carry[..., horizon:]
+        behind, ahead = slice(0, max(N - horizon, 0)), carry[..., horizon:]
         longer, more = np.zeros_like(carry), noise.copy()
         moved = _times(ahead, noise[..., behind])
         more[..., horizon:] += _times_transposed(moved, ahead)

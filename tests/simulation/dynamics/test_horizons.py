@@ -132,6 +132,6 @@ def test_the_scale_of_undeclared_noise_is_the_most_likely() -> None:
     assert best > max(at(0.8), at(1.25))
 
 
-def test_horizons_reach_a_tenth_of_the_shortest_run() -> None:
-    assert horizons_of(flow(0, restart=None)) == (1, 4)
-    assert horizons_of(flow(0, restart=22)) == (1,)
+def test_horizons_reach_a_tenth_of_the_shortest_run_and_last_the_whole_of_the_longest() -> None:
+    assert horizons_of(flow(0, restart=None)) == (1, 4, 64)
+    assert horizons_of(flow(0, restart=22)) == (1, 32)
