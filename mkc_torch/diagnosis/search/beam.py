@@ -9,7 +9,15 @@ from functools import cached_property, partial
 
 import torch
 
-from mkc_torch.diagnosis.model.fit import ROUGH, SEARCH, FittedModel, fitted, fitted_with_effect, without_term
+from mkc_torch.diagnosis.model.fit import (
+    ROUGH,
+    SEARCH,
+    FittedModel,
+    clipped_residual,
+    fitted,
+    fitted_with_effect,
+    without_term,
+)
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise, has_process_noise
 from mkc_torch.diagnosis.model.shapes import shape_fitted, with_form_of_grid, with_profiled_shape
@@ -118,6 +126,7 @@ class BeamSearch:
     models: dict[ModelKey, Candidate] = field(default_factory=dict)
     most_terms: int = MOST_TERMS
     most_models: int = MOST_MODELS
+    _elsewhere: FittedModel | None = None
 
     def run(
         self, start: FittedModel, further: Sequence[Term] = (), progress: Callable[[int], object] = lambda _: None
@@ -130,6 +139,7 @@ class BeamSearch:
             progress: called with the number of models after each round.
         """
         self._keep([Candidate(start, score(start, self.basis, self.settings), "")])
+        self._elsewhere = at_initial_values(start, self.settings.search.ran_away)
         terms = with_wide_grid(self.terms, start.model.prepared)
         expanded: set[ModelKey] = set()
         while len(self.models) < self.most_models:
@@ -210,9 +220,11 @@ class BeamSearch:
         fit, have = model.fit, len(model.fit.model.terms)
         works: list[tuple[ModelKey, str, Callable[[], FittedModel | None]]] = []
         if have < self.most_terms and not any(term.effect.is_curve for term in fit.model.terms):
+            elsewhere = self._far_starts(terms) if not have else {}
             for addition in self._chosen(additions(fit, terms, self.settings.noise), model, rank, further):
                 key = model_key([*fit.model.terms, addition.starts[0][0]])
-                works.append((key, f"add {self._id(addition.starts[0][0])}", partial(_with, fit, addition)))
+                work = partial(_with, fit, addition, elsewhere.get(addition.key, ()))
+                works.append((key, f"add {self._id(addition.starts[0][0])}", work))
         for number, term in enumerate(fit.model.terms):
             if have > 1:
                 rest = [other for other in fit.model.terms if other is not term]
@@ -224,6 +236,16 @@ class BeamSearch:
         orders = in_other_orders(fit)
         works += [(model_key(o), "another order in series", partial(_reordered, fit, o)) for o in orders]
         self._fit(works, fit, self.most_models)
+
+    def _far_starts(self, terms: Sequence[Term]) -> dict[Key, list[tuple[Term, torch.Tensor]]]:
+        """Return starts of each effect from the initial values of the simulation, if its fit went far from them."""
+        there = self._elsewhere
+        if there is None:
+            return {}
+        return {
+            addition.key: [(term, torch.cat([there.parameters, size])) for term, size in addition.starts[:_POLISHED]]
+            for addition in additions(there, terms, self.settings.noise)
+        }
 
     def with_one_less(self, model: Candidate) -> list[Candidate]:
         """Return the models without one of a model's effects, fitted if they are not known."""
@@ -358,11 +380,35 @@ def _best(fits: Sequence[FittedModel]) -> FittedModel:
     return max(fits, key=lambda fit: fit.log_likelihood)
 
 
-def _with(fit: FittedModel, addition: Addition) -> FittedModel:
-    """Return the fit with one more effect, from its best shapes."""
+def at_initial_values(fit: FittedModel, away: float) -> FittedModel | None:
+    """Return a fit moved to the initial values of its parameters; None if it stayed near them.
+
+    A missing effect can drive a parameter to where no effect helps.
+
+    Args:
+        fit: of the simulation alone.
+        away: factor by which a parameter has grown or shrunk that is far.
+    """
+    prepared = fit.model.prepared
+    theta, own = prepared.start(), fit.model.base - prepared.beginnings
+    sizes = torch.stack([theta[:own], fit.parameters[:own]]).abs()
+    if not bool((sizes.amax(0) > away * sizes.amin(0)).any()):
+        return None
+    residual = fit.model.residual(theta)
+    # a clipped residual: at values that are not fitted any sample may be far
+    value, _ = clipped_residual(residual)
+    return replace(fit, parameters=theta, residual=value) if bool(residual.isfinite().all()) else None
+
+
+def _with(fit: FittedModel, addition: Addition, far: Sequence[tuple[Term, torch.Tensor]] = ()) -> FittedModel:
+    """Return the fit with one more effect, from its best shapes; also from further starts with all parameters."""
     begun = sorted((_begun(fit, term, size) for term, size in addition.starts), key=lambda found: -found.log_likelihood)
     least = 0.5 * (begun[0].log_likelihood + fit.log_likelihood)
     near = [found for number, found in enumerate(begun[:_POLISHED]) if number == 0 or found.log_likelihood >= least]
+    if far:
+        # far from the solution the first steps need a wide scale
+        others = [fitted_with_effect(fit, fit.model.with_term(term), start, effort=SEARCH) for term, start in far]
+        near.append(_best(others))
     return with_form_of_grid(_best([_polished(found) for found in near]), SEARCH)
 
 
