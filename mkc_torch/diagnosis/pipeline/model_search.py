@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -99,8 +99,8 @@ def search_models(
     if first.p_value > options.level:
         follow = _follow(beam) if not options.quick else ()
         return replace(search, left=(), first=replace(first, follow=follow))
-    for model in _in_turn(beam):
-        found = _tested(search, model, beam, base, options, generator, keep)
+    for chain in _in_turn(beam):
+        found = _tested(search, chain, beam, base, options, generator, keep)
         if found.found or not found.unconfirmed:
             return found
         search = replace(search, unconfirmed=search.unconfirmed or found.unconfirmed)
@@ -171,14 +171,15 @@ def _goodness(fit: FittedModel) -> tuple[GoodnessOfFit, ...]:
     return goodness_of_fit(fit.model.prepared, fit.residual, {}, None)
 
 
-def _in_turn(beam: BeamSearch) -> list[Candidate]:
-    """Return the best model with effects, and behind it the next best with one effect.
+def _in_turn(beam: BeamSearch) -> list[list[Candidate]]:
+    """Return chains of models: that of the best model whose effects each raise the score, and models with one effect.
 
-    The screening has shown that an effect is missing, so the simulation alone is no rival: any model that is more
-    likely is tested.
+    Effects that only gain together have no null in which the first is missing alone. The screening has shown that an
+    effect is missing, so the simulation alone is no rival of models with one effect: those that are more likely are
+    tested if the first chain is refused.
     """
-    alone = beam.models[()].score
-    least = -math.inf if alone is None else alone.log_likelihood
+    alone = beam.models[()]
+    least = -math.inf if alone.score is None else alone.score.log_likelihood
     usable = [
         model
         for model in beam.models.values()
@@ -188,24 +189,29 @@ def _in_turn(beam: BeamSearch) -> list[Candidate]:
         and not beam.enlarges(model)
     ]
     ranked = sorted(usable, key=lambda model: -model.value)
-    single = [model for model in ranked if len(model.fit.model.terms) == 1]
-    return [*ranked[:1], *[model for model in single if model is not ranked[0]]][:_NEXT]
+    single = [[model] for model in ranked if len(model.fit.model.terms) == 1]
+    for model in ranked:
+        if len(model.fit.model.terms) == 1 or model.value <= alone.value:
+            break
+        chain = _chain(model, beam)
+        if all(later.value > earlier.value for earlier, later in itertools.pairwise([alone, *chain])):
+            return [chain, *[other for other in single if other[0].key != chain[0].key]][:_NEXT]
+    return single[:_NEXT]
 
 
 def _tested(
     search: StepwiseSearch,
-    model: Candidate,
+    chain: Sequence[Candidate],
     beam: BeamSearch,
     base: ProcessNoiseFit,
     options: SearchOptions,
     generator: torch.Generator,
     keep: Keep,
 ) -> StepwiseSearch:
-    """Add the effects of a model one after the other as long as each is significant.
+    """Add the effects of a chain of models one after the other as long as each is significant.
 
     The null of each is the model with the effects before it, and all candidates are screened again.
     """
-    chain = _chain(model, beam)
     for number, step in enumerate(chain):
         previous = search.found[-1].fit if search.found else base.fit
         try:
