@@ -49,6 +49,9 @@ effect is in 18 of 28.
 _NEXT = 3
 """Models that are asked in turn if held-out blocks refuse the only effect of the best."""
 
+_NAMED = 1.15
+"""Ratio of open-loop residuals up to which named effects are preferred to a curve without a name."""
+
 _KEPT = 0.5
 """Share of the gain over the simulation alone that a fit under process noise may lose to the open-loop fit."""
 
@@ -172,11 +175,12 @@ def _goodness(fit: FittedModel) -> tuple[GoodnessOfFit, ...]:
 
 
 def _in_turn(beam: BeamSearch) -> list[list[Candidate]]:
-    """Return chains of models: that of the best model whose effects each raise the score, and models with one effect.
+    """Return chains of models to test: that of the simplest good model, and models with one effect.
 
-    Effects that only gain together have no null in which the first is missing alone. The screening has shown that an
-    effect is missing, so the simulation alone is no rival of models with one effect: those that are more likely are
-    tested if the first chain is refused.
+    The simplest good model has the lowest price of those that this recording cannot separate from the highest score,
+    and each of its effects raises the score: effects that only gain together have no null in which the first is
+    missing alone. The screening has shown that an effect is missing, so the simulation alone is no rival of models with
+    one effect: those that are more likely are tested if the first chain is refused.
     """
     alone = beam.models[()]
     least = -math.inf if alone.score is None else alone.score.log_likelihood
@@ -188,15 +192,34 @@ def _in_turn(beam: BeamSearch) -> list[list[Candidate]]:
         and model.score.log_likelihood > least
         and not beam.enlarges(model)
     ]
-    ranked = sorted(usable, key=lambda model: -model.value)
+    ranked = sorted(_named(usable, alone), key=lambda model: -model.value)
     single = [[model] for model in ranked if len(model.fit.model.terms) == 1]
-    for model in ranked:
-        if len(model.fit.model.terms) == 1 or model.value <= alone.value:
-            break
+    good = [model for model in ranked if model.value > alone.value]
+    behind = beam.settings.naming.separable * beam.basis.kappa
+    alike = [model for model in good if model.value >= good[0].value - behind]
+    for model in [*sorted(alike, key=lambda model: model.price), *good[len(alike) :]]:
         chain = _chain(model, beam)
         if all(later.value > earlier.value for earlier, later in itertools.pairwise([alone, *chain])):
             return [chain, *[other for other in single if other[0].key != chain[0].key]][:_NEXT]
     return single[:_NEXT]
+
+
+def _named(models: Sequence[Candidate], alone: Candidate) -> list[Candidate]:
+    """Return the models, without those whose curve follows hardly better than a model of named effects.
+
+    A curve can follow any physics; it is the answer where no effect of the catalogue comes near.
+    """
+    curves = {model.key: any(term.effect.is_curve for term in model.fit.model.terms) for model in models}
+    named = [model for model in models if not curves[model.key] and model.value > alone.value]
+
+    def replaced(model: Candidate) -> bool:
+        return any(
+            len(other.fit.model.terms) <= len(model.fit.model.terms)
+            and other.log_size <= model.log_size + math.log(_NAMED)
+            for other in named
+        )
+
+    return [model for model in models if not (curves[model.key] and replaced(model))]
 
 
 def _tested(

@@ -87,6 +87,11 @@ class Candidate:
         return -float("inf") if self.score is None else self.score.value
 
     @property
+    def price(self) -> float:
+        """The price of the model's numbers, effects and noise in nats."""
+        return float("inf") if self.score is None else self.score.log_likelihood - self.score.value
+
+    @property
     def key(self) -> ModelKey:
         """Identity of the model."""
         return model_key(self.fit.model.terms)
@@ -279,7 +284,8 @@ class BeamSearch:
     def _price(self, term: Term, size: torch.Tensor) -> float:
         naming = self.settings.naming
         form = naming.is_generalisation * term.effect.is_generalisation + naming.nameless * term.effect.is_curve
-        return self.basis.number * (len(size) + len(term.effect.fitted_shape)) + self.basis.choice + form
+        numbers = len(size) + len(term.effect.fitted_shape)
+        return self.basis.number * numbers + self.basis.kappa * (self.basis.choice + form)
 
     def _id(self, term: Term) -> str:
         return suspect_id(term, self.terms)
