@@ -324,7 +324,7 @@ class BeamSearch:
         if has_process_noise(model.fit):
             return model
         try:
-            noisy = fit_with_process_noise(model.fit, self.declared, self.settings.noise).fit
+            noisy = shape_fitted(fit_with_process_noise(model.fit, self.declared, self.settings.noise).fit)
         except NoFitError:
             return model
         return self._better(model, noisy, less)
