@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.density import fit_density
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted, no_first_fit
 from mkc_torch.diagnosis.model.joint import JointModel
@@ -236,6 +237,30 @@ def fit_with_process_noise(
     if best[1].observer is None and free is not None:
         return ProcessNoiseFit(free, free, best[1], starts)
     return ProcessNoiseFit(free, *best, starts)
+
+
+def with_noise_around(fit: FittedModel, declared: Mapping[str, float], settings: NoiseSettings) -> FittedModel:
+    """Return a fit at the same parameters, along the observer of its most likely noise.
+
+    Parameters that are fitted together with process noise can leave the open loop that they were chosen for.
+    """
+    noise = estimate_noise(fit, declared, settings)
+    if noise is None or noise.observer is None:
+        return fit
+    model = JointModel(fit.model.prepared.observed(noise.observer), fit.model.terms, fit.model.near)
+    residual = model.residual(fit.parameters).detach()
+    if not bool(residual.isfinite().all()):
+        return fit
+    density = fit_density(residual, bound=fit.bound)
+    return replace(
+        fit,
+        model=model,
+        sigma=density.sigma,
+        d=density.d,
+        residual=residual,
+        weights=torch.exp(-0.5 * (residual / (density.d * density.sigma)).square()),
+        log_likelihood=float(density.log_likelihood.sum()) * len(residual),
+    )
 
 
 def refit_noise(

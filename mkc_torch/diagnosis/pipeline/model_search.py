@@ -19,6 +19,7 @@ from mkc_torch.diagnosis.model.process_noise import (
     first_samples,
     fit_with_process_noise,
     has_process_noise,
+    with_noise_around,
 )
 from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term
@@ -315,8 +316,12 @@ def _final(step: Candidate, beam: BeamSearch, options: SearchOptions, *, last: b
     # tests of evidence need residuals that are white under the noise; a lag of a sensor is exact in open loop only
     gained = step.value - beam.models[()].value
     less = max(options.settings.naming.separable * beam.basis.kappa, _KEPT * gained)
-    step = beam.under_noise(beam.to_the_end(step), less)
-    return beam.with_best_hold(step, options.fixed) if last else step
+    whole = beam.to_the_end(step)
+    whole = beam.with_best_hold(whole, options.fixed) if last else whole
+    noisy = beam.under_noise(whole, less)
+    if noisy is not whole or has_process_noise(whole.fit):
+        return noisy
+    return replace(whole, fit=with_noise_around(whole.fit, options.declared, options.settings.noise))
 
 
 def _as_result(located: SearchResult, step: Candidate, beam: BeamSearch) -> SearchResult:

@@ -50,6 +50,9 @@ MOST_MODELS = 60
 _ADDITIONS = (12, 5, 3, 2, 2, 2)
 """Number of effects that are tried in addition to the best model of the beam, the second, and so on."""
 
+_TWINS = (2, 1, 0)
+"""Number of these that repeat an effect of the model at another place, whatever their linear gain."""
+
 LARGER = 1.05
 """Ratio of open-loop residuals with and without an effect above which it enlarges the residual: the ratio at which
 held-out blocks reject a finding."""
@@ -274,8 +277,11 @@ class BeamSearch:
         most = _ADDITIONS[min(rank, len(_ADDITIONS) - 1)]
         ranked = sorted(found, key=value, reverse=True)
         if model.fit.model.terms:
+            own = {term.effect.id for term in model.fit.model.terms}
+            # an effect at two places, as two vessels that overflow, may show only with both
+            twins = [a for a in ranked if a.starts[0][0].effect.id in own][: _TWINS[min(rank, len(_TWINS) - 1)]]
             ranked = [a for a in ranked if a.gain >= _PAYS * self._price(a.starts[0][0], a.starts[0][1])]
-            return ranked[:most]
+            return list({a.key: a for a in [*ranked[:most], *twins]}.values())
         first = [addition for term in further for addition in found if addition.key == term.key]
         first = list({addition.key: addition for addition in first}.values())
         others = [addition for addition in ranked if addition.key not in {a.key for a in first}]
