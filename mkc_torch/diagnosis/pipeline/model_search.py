@@ -140,6 +140,7 @@ def _beam(base: ProcessNoiseFit, first: SearchResult, terms: tuple[Term, ...], o
     basis = basis_of(base.fit, len({term.key for term in terms}), options.declared, options.settings)
     leaders = [terms[rival.number] for rival in first.ranking[: options.settings.search.own_noise]]
     beam = BeamSearch(terms, basis, options.settings, options.declared)
+    beam.noisy = base.fit if has_process_noise(base.fit) and not options.quick else None
     significant = first.p_value <= options.level
     if options.quick:
         beam.most_models = _QUICK_MODELS

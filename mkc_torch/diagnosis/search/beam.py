@@ -125,6 +125,7 @@ class BeamSearch:
         models: the scored models by identity, in the order in which they were tried.
         most_terms: largest number of effects of a model.
         most_models: largest number of models that the search tries.
+        noisy: the simulation alone under its process noise; None without.
     """
 
     terms: tuple[Term, ...]
@@ -134,7 +135,7 @@ class BeamSearch:
     models: dict[ModelKey, Candidate] = field(default_factory=dict)
     most_terms: int = MOST_TERMS
     most_models: int = MOST_MODELS
-    _elsewhere: FittedModel | None = None
+    noisy: FittedModel | None = None
 
     def run(
         self, start: FittedModel, further: Sequence[Term] = (), progress: Callable[[int], object] = lambda _: None
@@ -147,7 +148,6 @@ class BeamSearch:
             progress: called with the number of models after each round.
         """
         self._keep([Candidate(start, score(start, self.basis, self.settings), "")])
-        self._elsewhere = at_initial_values(start, self.settings.search.ran_away)
         terms = with_wide_grid(self.terms, start.model.prepared)
         expanded: set[ModelKey] = set()
         while len(self.models) < self.most_models:
@@ -228,10 +228,10 @@ class BeamSearch:
         fit, have = model.fit, len(model.fit.model.terms)
         works: list[tuple[ModelKey, str, Callable[[], FittedModel | None]]] = []
         if have < self.most_terms and not any(term.effect.is_curve for term in fit.model.terms):
-            elsewhere = self._far_starts(terms) if not have else {}
+            others = self._other_starts(fit, terms, further) if not have else {}
             for addition in self._chosen(additions(fit, terms, self.settings.noise), model, rank, further):
                 key = model_key([*fit.model.terms, addition.starts[0][0]])
-                work = partial(_with, fit, addition, elsewhere.get(addition.key, ()))
+                work = partial(_with, fit, addition, others.get(addition.key, ()))
                 works.append((key, f"add {self._id(addition.starts[0][0])}", work))
         for number, term in enumerate(fit.model.terms):
             if have > 1:
@@ -245,15 +245,29 @@ class BeamSearch:
         works += [(model_key(o), "another order in series", partial(_reordered, fit, o)) for o in orders]
         self._fit(works, fit, self.most_models)
 
-    def _far_starts(self, terms: Sequence[Term]) -> dict[Key, list[tuple[Term, torch.Tensor]]]:
-        """Return starts of each effect from the initial values of the simulation, if its fit went far from them."""
-        there = self._elsewhere
-        if there is None:
-            return {}
-        return {
-            addition.key: [(term, torch.cat([there.parameters, size])) for term, size in addition.starts[:_POLISHED]]
-            for addition in additions(there, terms, self.settings.noise)
-        }
+    def _other_starts(
+        self, fit: FittedModel, terms: Sequence[Term], further: Sequence[Term]
+    ) -> dict[Key, list[Callable[[], FittedModel | None]]]:
+        """Return fits of each effect from elsewhere than the simulation alone in open loop.
+
+        From its initial values, if the fit went far from them; and through the process noise of the simulation alone,
+        along whose trajectory a strong effect can be fitted that the open loop does not reach. The latter is slow, and
+        is for the candidates that the screening found there.
+        """
+        found: dict[Key, list[Callable[[], FittedModel | None]]] = {}
+        there, noisy = at_initial_values(fit, self.settings.search.ran_away), self.noisy
+        if there is not None:
+            for addition in additions(there, terms, self.settings.noise):
+                for term, size in addition.starts[:_POLISHED]:
+                    start = torch.cat([there.parameters, size])
+                    work = partial(fitted_with_effect, fit, fit.model.with_term(term), start, effort=SEARCH)
+                    found.setdefault(addition.key, []).append(work)
+        if noisy is not None:
+            leading = {term.key for term in further}
+            led = [term for term in terms if term.key in leading]
+            for addition in additions(noisy, led, self.settings.noise):
+                found.setdefault(addition.key, []).append(partial(_through_noise, noisy, *addition.starts[0]))
+        return found
 
     def with_one_less(self, model: Candidate) -> list[Candidate]:
         """Return the models without one of a model's effects, fitted if they are not known."""
@@ -412,15 +426,18 @@ def at_initial_values(fit: FittedModel, away: float) -> FittedModel | None:
     return replace(fit, parameters=theta, residual=value) if bool(residual.isfinite().all()) else None
 
 
-def _with(fit: FittedModel, addition: Addition, far: Sequence[tuple[Term, torch.Tensor]] = ()) -> FittedModel:
-    """Return the fit with one more effect, from its best shapes; also from further starts with all parameters."""
+def _through_noise(noisy: FittedModel, term: Term, size: torch.Tensor) -> FittedModel | None:
+    """Return the open-loop fit with an effect from its fit under process noise."""
+    start = torch.cat([noisy.parameters, size])
+    return fitted_with_effect(noisy, noisy.model.with_term(term), start, graduate=False, effort=SEARCH).open_loop
+
+
+def _with(fit: FittedModel, addition: Addition, others: Sequence[Callable[[], FittedModel | None]] = ()) -> FittedModel:
+    """Return the fit with one more effect, from its best shapes and from other fits."""
     begun = sorted((_begun(fit, term, size) for term, size in addition.starts), key=lambda found: -found.log_likelihood)
     least = 0.5 * (begun[0].log_likelihood + fit.log_likelihood)
     near = [found for number, found in enumerate(begun[:_POLISHED]) if number == 0 or found.log_likelihood >= least]
-    if far:
-        # far from the solution the first steps need a wide scale
-        others = [fitted_with_effect(fit, fit.model.with_term(term), start, effort=SEARCH) for term, start in far]
-        near.append(_best(others))
+    near += [found for other in others if (found := other()) is not None]
     return with_form_of_grid(_best([_polished(found) for found in near]), SEARCH)
 
 
