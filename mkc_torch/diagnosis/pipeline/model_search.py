@@ -105,6 +105,9 @@ def search_models(
         return replace(search, left=(), first=replace(first, follow=follow))
     for chain in _in_turn(beam):
         found = _tested(search, chain, beam, base, options, generator, keep)
+        for other in _other_ways(chain, len(found.found), beam):
+            again = _tested(search, other, beam, base, options, generator, keep)
+            found = again if len(again.found) > len(found.found) else found
         if found.found or not found.unconfirmed:
             return found
         search = replace(search, unconfirmed=search.unconfirmed or found.unconfirmed)
@@ -298,11 +301,30 @@ def _chain(model: Candidate, beam: BeamSearch) -> list[Candidate]:
         if not less:
             break
         chain.insert(0, max(less, key=lambda candidate: candidate.value))
-    # the terms of each model in the order in which they enter
-    for number in range(1, len(chain)):
-        ordered = [*chain[number - 1].fit.model.terms, *_missing(chain[number], chain[number - 1])]
-        chain[number] = in_order(chain[number], ordered)
-    return chain
+    return _in_orders_of(chain)
+
+
+def _in_orders_of(chain: Sequence[Candidate]) -> list[Candidate]:
+    """Return a chain with the effects of each model in the order in which they enter."""
+    ordered = [chain[0]]
+    for model in chain[1:]:
+        before = ordered[-1]
+        ordered.append(in_order(model, [*before.fit.model.terms, *_missing(model, before)]))
+    return ordered
+
+
+def _other_ways(chain: Sequence[Candidate], reached: int, beam: BeamSearch) -> list[list[Candidate]]:
+    """Return chains that end a step behind the effects that were found, and reach it through other effects.
+
+    A linear screening may not see an effect while another is missing: a second vessel that fills only once the first
+    overflows.
+    """
+    if not 0 < reached < len(chain):
+        return []
+    last = {term.key for term in _missing(chain[reached], chain[reached - 1])}
+    ways = [less for less in beam.with_one_less(chain[reached]) if last & {term.key for term in less.fit.model.terms}]
+    ways.sort(key=lambda model: -model.value)
+    return [_in_orders_of([*_chain(way, beam), chain[reached]]) for way in ways[:1]]
 
 
 def _missing(model: Candidate, smaller: Candidate) -> list[Term]:

@@ -21,6 +21,7 @@ from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.pipeline.stepwise import first_step, next_step
 from mkc_torch.diagnosis.score import basis_of, highest
 from mkc_torch.diagnosis.search.estimate import with_smaller_step
+from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 
@@ -65,7 +66,10 @@ def _at_smaller_step(problem: Problem, known: PartialResult, search: StepwiseSea
         finer = with_smaller_step(search.found[-1].fit, known.options.settings.noise)
         if finer is None:
             break
-        search = with_step_of(search, fit_baseline(problem, known, finer), known.options)
+        try:
+            search = with_step_of(search, fit_baseline(problem, known, finer), known.options)
+        except NoFitError:
+            break  # the findings at the coarser step remain
     return search
 
 
