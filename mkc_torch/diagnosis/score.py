@@ -165,7 +165,8 @@ def _kappa(fit: FittedModel, noise: NoiseModel, basis: ScoreBasis) -> float:
     generator, horizons = np.random.default_rng(0), basis.horizons[:-1] or basis.horizons
     flow = replace(flow, counts=basis.counts, shift=np.zeros_like(flow.shift))
     draws = [replace(flow, new=new) for new in drawn(flow, noise, _DRAWS, generator)]
-    return variance_ratio([per_sample(draw, noise, horizons, basis.span) for draw in draws], horizons[-1])
+    whole = (basis.counts > 0.0).all(1)  # a sample that is masked in part has another mean
+    return variance_ratio([per_sample(draw, noise, horizons, basis.span)[whole] for draw in draws], horizons[-1])
 
 
 def variance_ratio(series: Sequence[Float[np.ndarray, " N"]], reach: int) -> float:
@@ -184,7 +185,7 @@ def variance_ratio(series: Sequence[Float[np.ndarray, " N"]], reach: int) -> flo
     """
     power = total = 0.0
     for values in series:
-        away = values - values.mean()
+        away = values - values.mean() if len(values) else values
         power += float(away @ away)
         lags = range(1, min(reach, len(away) - 1) + 1)
         total += sum((1.0 - lag / (reach + 1)) * float(away[lag:] @ away[:-lag]) for lag in lags)

@@ -134,7 +134,18 @@ def test_parts_add_up_to_the_score() -> None:
     assert found.terms == pytest.approx(math.log(10))
     dearer = score(friction, replace(basis, kappa=2.0 * basis.kappa), Settings())
     assert dearer is not None
-    assert dearer.value == pytest.approx(found.value - found.numbers)
+    assert dearer.value == pytest.approx(found.value - prices)
+
+
+def test_the_prices_factor_is_1_under_white_noise_and_larger_under_process_noise() -> None:
+    white, pushed = (fits(Slide(), recorded(5, jolt=jolt))[0] for jolt in (0.0, 0.3))
+    assert basis_of(white, 10, {}, Settings()).kappa == 1.0
+    assert basis_of(pushed, 10, {}, Settings()).kappa > 1.5
+
+
+def test_the_last_horizon_is_the_free_run() -> None:
+    basis = basis_of(fits(Slide(), recorded(5))[0], 10, {}, Settings())
+    assert basis.horizons == (1, 4, 16, 256)  # a power of 2 that is longer than the recording
 
 
 def linear_flow(process: float, seed: int) -> Flow:

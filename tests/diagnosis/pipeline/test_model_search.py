@@ -72,6 +72,17 @@ def test_two_effects_are_found_one_after_the_other():
 
 
 @pytest.mark.e2e
+def test_a_special_case_comes_before_its_general_form_and_a_curve():
+    """Quadratic drag, a power of the speed and a free curve of it all follow the recording."""
+    search = searched(baseline(DRAG), names=("quadratic_drag", "power_law", "unknown"))
+    (found,) = search.found
+    assert found.term.effect.id == "quadratic_drag"
+    assert {"quadratic_drag@speed", "power_law@speed", "unknown@speed"} <= {
+        name for model in search.models for name in model.terms
+    }
+
+
+@pytest.mark.e2e
 def test_rivals_are_ordered_by_their_gaps_and_each_effect_is_one():
     for found in found_both().found:
         terms = found.scene.terms
@@ -236,7 +247,7 @@ def test_hidden_drag_is_named_and_sized_under_process_noise():
     terms, options = candidates(base.fit, DYNAMICS), replace(OPTIONS, surrogates=39, max_findings=1)
     search = search_models(base, terms, options, torch.Generator().manual_seed(0), lambda _: None)
     (found,) = search.found
-    assert found.p_value == pytest.approx(1.0 / 40.0)
+    assert found.p_value <= 2.0 / 40.0  # two statistics
     assert (found.term.effect.id, found.term.port) == ("quadratic_drag", "rate of rate")
     assert found.fit.model.terms[-1] is found.term
     (drag,) = found.fit.model.gammas(found.fit.parameters)[-1].tolist()

@@ -7,14 +7,17 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch import Recording
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.score import FAR, basis_of, score
 from mkc_torch.diagnosis.search import beam as beam_module
-from mkc_torch.diagnosis.search.beam import LARGER, BeamSearch, Candidate, in_order, model_key
+from mkc_torch.diagnosis.search.beam import LARGER, BeamSearch, Candidate, at_initial_values, in_order, model_key
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
-from tests.diagnosis.cart import DRAG, FRICTION, NOISE, cart_terms, first_term, fit_with, free_fit
+from mkc_torch.simulation import Dynamics, Parameter
+from tests.diagnosis.cart import DRAG, FRICTION, NOISE, cart_recording, cart_terms, first_term, fit_with, free_fit
 
 SETTINGS = Settings()
 NAMES = ("quadratic_drag", "coulomb_friction", "constant_force")
@@ -214,6 +217,39 @@ def test_a_given_set_of_effects_is_fitted_from_the_shapes_of_their_grids():
     assert model.move == "suspected"
     assert [term.effect.id for term in model.fit.model.terms] == ["coulomb_friction", "quadratic_drag"]
     assert model.value > max(best_value(beam, "coulomb_friction"), best_value(beam, "quadratic_drag"))
+
+
+class TwoCarts(Dynamics):
+    """Two carts that do not touch, driven by the same force."""
+
+    states = ("first", "second")
+    inputs = ("force",)
+    parameters = {"gain": Parameter(1.0, lower=0.0)}
+
+    def derivative(self, time, x, u, p):
+        return {"first": p.gain * u.force, "second": p.gain * u.force}
+
+
+def test_an_effect_of_a_model_is_tried_at_other_places_whatever_its_linear_gain():
+    with_friction, without = (cart_recording(0.0, friction, mean=0.0, samples=160) for friction in (FRICTION, 0.0))
+    columns = {"time": without["time"], "force": without["force"]}
+    recording = Recording({**columns, "first": with_friction["speed"], "second": without["speed"]})
+    prepared = TwoCarts().prepare(recording)
+    fit = fitted(JointModel(prepared), prepared.start())
+    beam = beam_of(fit, cart_terms(fit, "coulomb_friction"))
+    beam.run(fit)
+    tried = {tuple(sorted(term.port for term in model.fit.model.terms)) for model in beam.models.values()}
+    assert ("rate of first", "rate of second") in tried
+    assert [term.port for term in beam.best.fit.model.terms] == ["rate of first"]
+
+
+def test_a_fit_far_from_its_initial_values_is_also_tried_from_there():
+    fit = start(DRAG, 0.0)
+    assert at_initial_values(fit, 5.0) is None
+    away = replace(fit, parameters=torch.cat([20.0 * fit.parameters[:1], fit.parameters[1:]]))
+    there = at_initial_values(away, 5.0)
+    assert there is not None
+    torch.testing.assert_close(there.parameters, fit.model.prepared.start())
 
 
 def test_the_models_without_one_of_the_effects_are_known_afterwards():

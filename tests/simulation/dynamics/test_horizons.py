@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
+from mkc_torch.simulation.dynamics.draws import drawn
 from mkc_torch.simulation.dynamics.horizons import horizons_of, log_likelihood_ahead, per_sample
 from mkc_torch.simulation.dynamics.kalman import OUTLIERS, FilterModels, Flow
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel, filter_models
@@ -88,7 +90,7 @@ def density(known: Flow, means: np.ndarray, covariances: np.ndarray) -> Float[np
 @pytest.mark.parametrize("noise", NOISES, ids=["white", "lasting and white", "drift"])
 @pytest.mark.parametrize("restart", [None, 22])
 def test_predictions_equal_a_propagation_sample_by_sample(noise: NoiseModel, restart: int | None) -> None:
-    known, horizons = flow(3, restart=restart), (1, 4, 16)
+    known, horizons = flow(3, restart=restart), (1, 4, 16, 64)  # the last is longer than the recording: the free run
     values, scales = log_likelihood_ahead(known, [noise], horizons, SPAN)
     each = [density(known, *one_by_one(known, noise, horizon)) for horizon in horizons]
     assert scales.tolist() == [1.0]  # declared noise
@@ -106,6 +108,21 @@ def test_white_sensor_noise_gives_the_free_run_over_every_horizon() -> None:
     means = np.einsum("nms,ns->nm", known.seen, path)
     covariances = np.broadcast_to(np.diag([0.64, 0.36]), (N, 2, 2))
     assert values[0, 0] == pytest.approx(density(known, means, covariances).sum(), rel=1e-9)
+
+
+@pytest.mark.parametrize("noise", NOISES, ids=["white", "lasting and white", "drift"])
+def test_drawn_recordings_have_the_covariance_of_the_free_run(noise: NoiseModel) -> None:
+    known = replace(flow(8), shift=np.zeros((N - 1, STATES)))
+    count = 8000
+    draws = drawn(known, noise, count, np.random.default_rng(0))
+    assert draws.shape == (count, N, OUTPUTS)
+    _, expected = one_by_one(known, noise, 64)
+    found = np.einsum("bkm,bkn->kmn", draws, draws) / count
+    size = np.sqrt(np.einsum("kmm->km", expected))
+    # standard errors of variances of 8,000 draws are 1.6 %; five of them
+    np.testing.assert_allclose(
+        found / size[:, :, None] / size[:, None], expected / size[:, :, None] / size[:, None], atol=0.08
+    )
 
 
 def test_models_of_different_kinds_are_evaluated_together() -> None:
