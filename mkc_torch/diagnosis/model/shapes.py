@@ -354,7 +354,7 @@ def _at_next(fit: FittedModel, name: str, grid: Sequence[float], steps: int, eff
 def _varied(fit: FittedModel) -> Iterator[Term]:
     """Yield the last effect with each of its delays and lags varied, within the limits."""
     term, prepared = fit.model.terms[-1], fit.model.prepared
-    if prepared.ports[term.port].kind != "input" or prepared.dynamics is None:
+    if prepared.ports[term.port].kind != "input":
         return
     for name, (low, high) in reach_of(term, prepared).items():
         if name in term.effect.continuous:

@@ -255,10 +255,7 @@ def _tested(
         alike = (base.free is None) == (step.fit.open_loop is None)
         if number == 0 and options.judged and alike and _refused(search.evidence[0], after, search, options):
             return replace(search, unconfirmed=located)
-        pairs = (*search.pairs, (search.evidence[-1], after))
-        search = replace(
-            search, found=(*search.found, located), evidence=(*search.evidence, after), pairs=pairs, left=()
-        )
+        search = replace(search, found=(*search.found, located), evidence=(*search.evidence, after), left=())
         suspected = (model for model in search.models if model.suspected)
         search = replace(search, models=(*trail_of(beam, step.fit), *suspected))
         keep(search)
@@ -283,8 +280,7 @@ def with_step_of(search: StepwiseSearch, base: ProcessNoiseFit, options: SearchO
             fit = fit_with_process_noise(fit, options.declared, options.settings.noise).fit
         found.append(replace(located, fit=fit, term=fit.model.terms[-1]))
         evidence.append(_evidence(search, fit, options))
-    pairs = tuple(itertools.pairwise(evidence))
-    return replace(search, found=tuple(found), evidence=tuple(evidence), pairs=pairs)
+    return replace(search, found=tuple(found), evidence=tuple(evidence))
 
 
 def _left(fit: FittedModel, beam: BeamSearch) -> tuple[Term, ...]:

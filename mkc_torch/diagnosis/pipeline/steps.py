@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 from mkc_torch.diagnosis.decisions import ScoredModel
@@ -21,7 +22,6 @@ class StepwiseSearch:
         blocks: the held-out blocks.
         evidence: of the simulation without findings, and after each finding.
         left: candidates that remain to be searched; empty once the search is over.
-        pairs: evidence without and with each finding, by which it was confirmed.
         refused: candidates that passed the surrogates, but are hardly visible.
         given_up: why the next search failed; empty if it did not.
         cut: whether there was a further finding beyond the limit.
@@ -35,7 +35,6 @@ class StepwiseSearch:
     blocks: HeldOutBlocks
     evidence: tuple[Evidence, ...]
     left: tuple[Term, ...]
-    pairs: tuple[tuple[Evidence, Evidence], ...] = ()
     refused: tuple[SearchResult, ...] = ()
     given_up: str = ""
     cut: bool = False
@@ -43,8 +42,12 @@ class StepwiseSearch:
     column: str = ""
 
     @property
+    def pairs(self) -> tuple[tuple[Evidence, Evidence], ...]:
+        """Evidence without and with each finding."""
+        return tuple(itertools.pairwise(self.evidence))
+
+    @property
     def parts(self) -> tuple[object, ...]:
         """Everything that the next search needs."""
         fits = [located.fit for located in self.found]
-        pairs = [evidence for pair in self.pairs for evidence in pair]
-        return self.first, *self.found, *fits, *(fit.model for fit in fits), self.blocks, *self.evidence, *pairs
+        return self.first, *self.found, *fits, *(fit.model for fit in fits), self.blocks, *self.evidence

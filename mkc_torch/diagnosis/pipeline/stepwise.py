@@ -18,9 +18,6 @@ from mkc_torch.diagnosis.evidence.held_out import (
     held_out,
 )
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.process_noise import (
-    first_samples,
-)
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time, innovation_gain
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
@@ -79,10 +76,8 @@ def first_step(
 
     ``keep`` is called with the search so far.
     """
-    prepared = base.model.prepared
     correlation = max(correlation_time(series) for series in base.pseudo(options.settings.noise)[0].unbind(1))
-    confirmation = options.settings.confirmation
-    blocks = blocks_of(len(base.residual), math.ceil(correlation), confirmation, first_samples(prepared))
+    blocks = blocks_of(len(base.residual), math.ceil(correlation), options.settings.confirmation)
     first = None
     so_far = StepwiseSearch(None, (), None, blocks, (), terms)
     keep(so_far)
@@ -233,7 +228,6 @@ def _accept(
     near = near_onset(located.fit, options.settings)
     known = (located.term, *fit.model.terms)  # a simpler form may have replaced the located effect
     left = tuple(t for t in search.left if not any(is_repeated(t, own, near, options.settings) for own in known))
-    pairs = (*search.pairs, (before, after))
-    taken = replace(search, found=found, evidence=(*search.evidence, after), pairs=pairs, left=left)
+    taken = replace(search, found=found, evidence=(*search.evidence, after), left=left)
     full = len(found) == options.max_findings and not _shows_more(taken, options)
     return replace(taken, left=()) if full else taken

@@ -137,15 +137,12 @@ class BeamSearch:
     most_models: int = MOST_MODELS
     noisy: FittedModel | None = None
 
-    def run(
-        self, start: FittedModel, further: Sequence[Term] = (), progress: Callable[[int], object] = lambda _: None
-    ) -> Candidate:
+    def run(self, start: FittedModel, further: Sequence[Term] = ()) -> Candidate:
         """Search from the simulation alone; return the model with the highest score.
 
         Args:
             start: the simulation alone, in open loop if that is found.
             further: candidates that are tried first, such as the leaders of another screening.
-            progress: called with the number of models after each round.
         """
         self._keep([Candidate(start, score(start, self.basis, self.settings), "")])
         terms = with_wide_grid(self.terms, start.model.prepared)
@@ -157,7 +154,6 @@ class BeamSearch:
             for rank, model in waiting:
                 expanded.add(model.key)
                 self._expand(model, rank, terms, further)
-            progress(len(self.models))
         self._under_noise()
         return self.best
 

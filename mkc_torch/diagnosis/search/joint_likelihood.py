@@ -88,7 +88,7 @@ class JointLikelihood:
         p_value: of the strongest candidate after the whole search, the largest over the kinds of noise.
         beyond: nats by which it exceeds the strongest surrogate.
         needed: (C,), gains in nats at which the p-value would equal the level.
-        noise: the most likely noise with each candidate; ``without`` that of the simulation without a candidate.
+        noise: the most likely noise with each candidate.
         scene: the linearised recording.
     """
 
@@ -98,7 +98,6 @@ class JointLikelihood:
     beyond: float
     needed: Float[Tensor, " C"]
     noise: tuple[NoiseModel, ...]
-    without: NoiseModel
     scene: _LinearisedRecording
 
     @property
@@ -239,7 +238,6 @@ def joint_likelihood(
         float(beyond),
         torch.from_numpy(needed),
         tuple(found.models[int(number)] for number in found.with_candidate[:, :, 0].argmax(0)),
-        found.models[best],
         scene,
     )
 

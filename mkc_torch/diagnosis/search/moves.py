@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.shapes import absolute, reach_of, within_a_sample
+from mkc_torch.diagnosis.model.shapes import reach_of, within_a_sample
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import NoiseSettings
@@ -208,16 +208,3 @@ def in_other_orders(fit: FittedModel) -> list[tuple[Term, ...]]:
         if not term.effect.remembers and term.port in lagging and ports[term.port].in_series(term.port):
             found.append((*terms[:number], replace(term, first=not term.first), *terms[number + 1 :]))
     return found
-
-
-__all__ = [
-    "STARTS",
-    "Addition",
-    "absolute",
-    "additions",
-    "in_other_orders",
-    "linear_gains",
-    "local_maxima",
-    "special_cases",
-    "with_wide_grid",
-]

@@ -115,7 +115,7 @@ def test_process_noise_is_limited_by_the_rates_of_the_recording():
     found = searched("white", 1)
     scene = found.scene
     least = dataclasses.replace(scene, largest=np.array([1e-12, 1e-12]))
-    models = NoiseGrid(scene.counted, found.without).singles()
+    models = NoiseGrid(scene.counted, dataclasses.replace(found.noise[0], components=())).singles()
     values = least.likelihoods(models).without[:, 0]
     # white noise alone is always allowed
     assert [bool(np.isfinite(value)) for value in values] == [not model.components for model in models]

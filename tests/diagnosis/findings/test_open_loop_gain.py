@@ -2,7 +2,7 @@
 
 import pytest
 
-from mkc_torch.diagnosis.search.ranking import improves_open_loop
+from mkc_torch.diagnosis.findings.shape import improves_open_loop
 from tests.diagnosis.cart import DRAG, first_term, fit_with, free_fit
 
 
