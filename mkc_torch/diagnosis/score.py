@@ -222,9 +222,9 @@ def score(fit: FittedModel, basis: ScoreBasis, settings: Settings, near: Sequenc
     return Score(
         by_horizon,
         basis.number * (numbers + _noise_numbers(noise)),
-        basis.kappa * basis.choice * len(fit.model.terms),
-        basis.kappa * settings.noise.disturbance_gain * disturbances,
-        basis.kappa * forms,
+        basis.choice * len(fit.model.terms),
+        settings.noise.disturbance_gain * disturbances,
+        forms,
         noise,
         per_sample(flow, noise, basis.horizons, basis.span),
     )
@@ -235,6 +235,27 @@ def highest(fits: Iterable[FittedModel | None], basis: ScoreBasis, settings: Set
     unique = {id(fit): fit for fit in fits if fit is not None}
     scores = [score(fit, basis, settings) for fit in unique.values()]
     return max((found.value for found in scores if found is not None), default=-math.inf)
+
+
+def separation(best: Score | None, other: Score | None, basis: ScoreBasis) -> float:
+    """Return how far a model is behind, in nats of a likelihood whose terms are independent; infinite without a score.
+
+    The difference of the scores over κ, or the nats at which a normal likelihood ratio is as many standard errors from
+    0 as the difference is, if these are fewer: models that follow different stretches differ by chance (Vuong,
+    Econometrica 57 (1989), 307).
+
+    Args:
+        best: the score of the preferred model.
+        other: the score of the other.
+        basis: what all scores share.
+    """
+    if best is None or other is None:
+        return math.inf
+    gap = best.value - other.value
+    away = best.per_sample - other.per_sample
+    away = away - away.mean()
+    error = math.sqrt(float(away @ away) * variance_ratio([away], len(away) // 10))
+    return min(gap / basis.kappa, 0.5 * gap * abs(gap) / max(error, 1e-300) ** 2)
 
 
 def _noise_numbers(noise: NoiseModel) -> int:
@@ -315,8 +336,7 @@ def _best_noise(
             )
             if any(size > basis.largest[place] for place, size, _ in scaled.components):
                 continue
-            disturbances = basis.kappa * settings.noise.disturbance_gain * len(noise.components)
-            price = disturbances + basis.number * _noise_numbers(noise)
+            price = settings.noise.disturbance_gain * len(noise.components) + basis.number * _noise_numbers(noise)
             value = float(each.mean()) - price
             if value > best[0]:
                 best = value, scaled, tuple(each.tolist())

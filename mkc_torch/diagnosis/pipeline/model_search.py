@@ -28,7 +28,7 @@ from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.pipeline.suspected import suspected_models
 from mkc_torch.diagnosis.pipeline.trail import trail_of
-from mkc_torch.diagnosis.score import basis_of, score
+from mkc_torch.diagnosis.score import basis_of, score, separation
 from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate, in_order
 from mkc_torch.diagnosis.search.columns import best_change
 from mkc_torch.diagnosis.search.ranking import Ranked
@@ -355,8 +355,7 @@ def _as_result(located: SearchResult, step: Candidate, beam: BeamSearch) -> Sear
         if len(model.fit.model.terms) == len(others) + 1 and len(more) == 1:
             known = rivals.get(more[0])
             rivals[more[0]] = model if known is None or model.value > known.value else known
-    # the score's nats are correlated by this ratio, the limits of separability are not
-    gaps = {key: (step.value - model.value) / beam.basis.kappa for key, model in rivals.items()}
+    gaps = {key: separation(step.score, model.score, beam.basis) for key, model in rivals.items()}
     gaps[own.key] = 0.0
     last = max([gap for gap in gaps.values() if math.isfinite(gap)], default=0.0)
     ranking = []

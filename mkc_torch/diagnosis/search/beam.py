@@ -300,8 +300,7 @@ class BeamSearch:
     def _price(self, term: Term, size: torch.Tensor) -> float:
         naming = self.settings.naming
         form = naming.is_generalisation * term.effect.is_generalisation + naming.nameless * term.effect.is_curve
-        numbers = len(size) + len(term.effect.fitted_shape)
-        return self.basis.number * numbers + self.basis.kappa * (self.basis.choice + form)
+        return self.basis.number * (len(size) + len(term.effect.fitted_shape)) + self.basis.choice + form
 
     def _id(self, term: Term) -> str:
         return suspect_id(term, self.terms)
