@@ -128,8 +128,8 @@ def table(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def _gain(row: Mapping[str, Any], kind: str, score: str) -> str:
-    values = [(row.get(name) or {}).get(score) for name in (kind, "alone")]
-    return "-" if None in values else f"{values[0] - values[1]:.1f}"
+    value, alone = ((row.get(name) or {}).get(score) for name in (kind, "alone"))
+    return "-" if value is None or alone is None else f"{value - alone:.1f}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

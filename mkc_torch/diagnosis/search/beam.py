@@ -10,22 +10,28 @@ from functools import cached_property, partial
 import torch
 
 from mkc_torch.diagnosis.model.fit import (
-    ROUGH,
     SEARCH,
     FittedModel,
-    clipped_residual,
     fitted,
     fitted_with_effect,
-    without_term,
 )
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise, has_process_noise
-from mkc_torch.diagnosis.model.shapes import shape_fitted, with_form_of_grid, with_profiled_shape
+from mkc_torch.diagnosis.model.shapes import shape_fitted, with_profiled_shape
 from mkc_torch.diagnosis.model.suspect import suspect_id
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
 from mkc_torch.diagnosis.score import Score, ScoreBasis, score
+from mkc_torch.diagnosis.search.move_fits import (
+    POLISHED,
+    at_initial_values,
+    fitted_exchanged,
+    fitted_held,
+    fitted_reordered,
+    fitted_through_noise,
+    fitted_with,
+    fitted_without,
+)
 from mkc_torch.diagnosis.search.moves import (
-    STARTS,
     Addition,
     additions,
     in_other_orders,
@@ -59,9 +65,6 @@ held-out blocks reject a finding."""
 
 _PAYS = 0.5
 """Share of its price that an addition to a model with effects has to gain in the linearised model."""
-
-_POLISHED = 2
-"""Rough fits of an effect that are refined to the end."""
 
 _NOISY = 3
 """Number of leading models that are also fitted under their process noise."""
@@ -203,7 +206,7 @@ class BeamSearch:
         found = [model for model in run_parallel(works, prepared, self.terms, "model") if model is not None]
         best = max(found, key=lambda model: model.value)
         if thorough:
-            others = [partial(_reordered, best.fit, order) for order in in_other_orders(best.fit)]
+            others = [partial(fitted_reordered, best.fit, order) for order in in_other_orders(best.fit)]
             works = [partial(self._scored, move, other) for other in others]
             found = [model for model in run_parallel(works, prepared, self.terms, "model") if model is not None]
             best = max([best, *found], key=lambda model: model.value)
@@ -216,7 +219,7 @@ class BeamSearch:
         for group in groups:
             wide = with_wide_grid(group, fit.model.prepared) or tuple(group)
             [addition] = additions(fit, wide, self.settings.noise)[:1]
-            fit = _with(fit, addition)
+            fit = fitted_with(fit, addition)
         return fit
 
     def _expand(self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term]) -> None:
@@ -227,18 +230,18 @@ class BeamSearch:
             others = self._other_starts(fit, terms, further) if not have else {}
             for addition in self._chosen(additions(fit, terms, self.settings.noise), model, rank, further):
                 key = model_key([*fit.model.terms, addition.starts[0][0]])
-                work = partial(_with, fit, addition, others.get(addition.key, ()))
+                work = partial(fitted_with, fit, addition, others.get(addition.key, ()))
                 works.append((key, f"add {self._id(addition.starts[0][0])}", work))
         for number, term in enumerate(fit.model.terms):
             if have > 1:
                 rest = [other for other in fit.model.terms if other is not term]
-                works.append((model_key(rest), f"drop {self._id(term)}", partial(_without, fit, number)))
+                works.append((model_key(rest), f"drop {self._id(term)}", partial(fitted_without, fit, number)))
             for other in special_cases(term, self.terms, fit.model.prepared):
                 rest = [*fit.model.terms[:number], *fit.model.terms[number + 1 :], other]
                 move = f"exchange {self._id(term)} for {self._id(other)}"
-                works.append((model_key(rest), move, partial(_exchanged, fit, number, self._all(other))))
+                works.append((model_key(rest), move, partial(fitted_exchanged, fit, number, self._all(other))))
         orders = in_other_orders(fit)
-        works += [(model_key(o), "another order in series", partial(_reordered, fit, o)) for o in orders]
+        works += [(model_key(o), "another order in series", partial(fitted_reordered, fit, o)) for o in orders]
         self._fit(works, fit, self.most_models)
 
     def _other_starts(
@@ -254,7 +257,7 @@ class BeamSearch:
         there, noisy = at_initial_values(fit, self.settings.search.ran_away), self.noisy
         if there is not None:
             for addition in additions(there, terms, self.settings.noise):
-                for term, size in addition.starts[:_POLISHED]:
+                for term, size in addition.starts[:POLISHED]:
                     start = torch.cat([there.parameters, size])
                     work = partial(fitted_with_effect, fit, fit.model.with_term(term), start, effort=SEARCH)
                     found.setdefault(addition.key, []).append(work)
@@ -262,7 +265,7 @@ class BeamSearch:
             leading = {term.key for term in further}
             led = [term for term in terms if term.key in leading]
             for addition in additions(noisy, led, self.settings.noise):
-                found.setdefault(addition.key, []).append(partial(_through_noise, noisy, *addition.starts[0]))
+                found.setdefault(addition.key, []).append(partial(fitted_through_noise, noisy, *addition.starts[0]))
         return found
 
     def with_one_less(self, model: Candidate) -> list[Candidate]:
@@ -272,7 +275,7 @@ class BeamSearch:
             (model_key([other for other in fit.model.terms if other is not term]), number, term)
             for number, term in enumerate(fit.model.terms)
         ]
-        works = [(key, f"drop {self._id(term)}", partial(_without, fit, number)) for key, number, term in rests]
+        works = [(key, f"drop {self._id(term)}", partial(fitted_without, fit, number)) for key, number, term in rests]
         self._fit(works, fit, len(self.models) + len(works))
         return [self.models[key] for key, _, _ in rests if key in self.models]
 
@@ -354,7 +357,7 @@ class BeamSearch:
         for name, how in model.fit.model.prepared.input_hold.items():
             for other in ("held", "linear"):
                 if name not in fixed and other != how:
-                    held = _held(model.fit, name, other)
+                    held = fitted_held(model.fit, name, other)
                     model = model if held is None else self._better(model, held)
         return model
 
@@ -395,101 +398,3 @@ def in_order(model: Candidate, terms: Sequence[Term]) -> Candidate:
 
 def _place_of(term: Term, groups: Sequence[Sequence[Term]]) -> int:
     return next(number for number, group in enumerate(groups) if term.key in {other.key for other in group})
-
-
-def _best(fits: Sequence[FittedModel]) -> FittedModel:
-    return max(fits, key=lambda fit: fit.log_likelihood)
-
-
-def at_initial_values(fit: FittedModel, away: float) -> FittedModel | None:
-    """Return a fit moved to the initial values of its parameters; None if it stayed near them.
-
-    A missing effect can drive a parameter to where no effect helps.
-
-    Args:
-        fit: of the simulation alone.
-        away: factor by which a parameter has grown or shrunk that is far.
-    """
-    prepared = fit.model.prepared
-    theta, own = prepared.start(), fit.model.base - prepared.beginnings
-    sizes = torch.stack([theta[:own], fit.parameters[:own]]).abs()
-    if not bool((sizes.amax(0) > away * sizes.amin(0)).any()):
-        return None
-    residual = fit.model.residual(theta)
-    # a clipped residual: at values that are not fitted any sample may be far
-    value, _ = clipped_residual(residual)
-    return replace(fit, parameters=theta, residual=value) if bool(residual.isfinite().all()) else None
-
-
-def _through_noise(noisy: FittedModel, term: Term, size: torch.Tensor) -> FittedModel | None:
-    """Return the open-loop fit with an effect from its fit under process noise."""
-    start = torch.cat([noisy.parameters, size])
-    return fitted_with_effect(noisy, noisy.model.with_term(term), start, graduate=False, effort=SEARCH).open_loop
-
-
-def _with(fit: FittedModel, addition: Addition, others: Sequence[Callable[[], FittedModel | None]] = ()) -> FittedModel:
-    """Return the fit with one more effect, from its best shapes and from other fits."""
-    begun = sorted((_begun(fit, term, size) for term, size in addition.starts), key=lambda found: -found.log_likelihood)
-    least = 0.5 * (begun[0].log_likelihood + fit.log_likelihood)
-    near = [found for number, found in enumerate(begun[:_POLISHED]) if number == 0 or found.log_likelihood >= least]
-    near += [found for other in others if (found := other()) is not None]
-    return with_form_of_grid(_best([_polished(found) for found in near]), SEARCH)
-
-
-def _polished(begun: FittedModel) -> FittedModel:
-    """Return a rough fit at the most likely sizes and shapes."""
-    if begun.model.terms[-1].effect.fitted_shape:
-        return shape_fitted(begun, SEARCH)
-    found = _refitted(begun, begun)
-    return begun if found is None else found
-
-
-def _begun(fit: FittedModel, term: Term, size: torch.Tensor) -> FittedModel:
-    """Return a rough fit with one more effect at a fixed shape: from its linear size, or from 0 if that is worse."""
-    model = fit.model.with_term(term)
-    found = fitted_with_effect(fit, model, torch.cat([fit.parameters, size]), graduate=False, effort=ROUGH)
-    if found.log_likelihood > fit.log_likelihood:
-        return found
-    zero = torch.cat([fit.parameters, torch.zeros_like(size)])
-    return _best([found, fitted_with_effect(fit, model, zero, graduate=False, effort=ROUGH)])
-
-
-def _without(fit: FittedModel, number: int) -> FittedModel | None:
-    start = without_term(fit, number)
-    try:
-        return shape_fitted(fitted(start.model, start.parameters, fit.bound, graduate=False, effort=SEARCH), SEARCH)
-    except NoFitError:
-        return None
-
-
-def _exchanged(fit: FittedModel, number: int, group: Sequence[Term]) -> FittedModel | None:
-    """Return the fit with another effect in place of one, from all shapes of its grid."""
-    rest = _without(fit, number) if len(fit.model.terms) > 1 else _refitted(without_term(fit, number), fit)
-    if rest is None:
-        return None
-    zero = rest.parameters.new_zeros(rest.model.with_term(group[0]).size - rest.model.size)
-    return _with(rest, Addition(tuple((term, zero) for term in group[:STARTS]), 0.0))
-
-
-def _refitted(start: FittedModel, like: FittedModel) -> FittedModel | None:
-    try:
-        return fitted(start.model, start.parameters, like.bound, graduate=False, effort=SEARCH)
-    except NoFitError:
-        return None
-
-
-def _held(fit: FittedModel, name: str, how: str) -> FittedModel | None:
-    """Return the fit with another hold of an input; its trajectory is found again if the fit's own is too far."""
-    moved = JointModel(fit.model.prepared.with_input_hold({name: how}), fit.model.terms, fit.model.near)
-    try:
-        return shape_fitted(fitted(moved, fit.parameters, fit.bound, fresh=True))
-    except NoFitError:
-        return None
-
-
-def _reordered(fit: FittedModel, terms: tuple[Term, ...]) -> FittedModel | None:
-    model = JointModel(fit.model.prepared, terms, fit.model.near)
-    try:
-        return shape_fitted(fitted(model, fit.parameters, fit.bound, graduate=False, effort=SEARCH), SEARCH)
-    except NoFitError:
-        return None

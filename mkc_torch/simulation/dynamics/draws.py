@@ -41,8 +41,8 @@ def drawn(flow: Flow, noise: NoiseModel, count: int, generator: np.random.Genera
             states = np.zeros_like(states)
             lag = size * generator.standard_normal(lag.shape)
         else:
-            push = models.white[0] * generator.standard_normal((count, flow.rates)) + lag @ into[:, : flow.rates]
-            states = states @ flow.transition[k - 1].T + push @ flow.noise_input[k - 1].T
+            kick = models.white[0] * generator.standard_normal((count, flow.rates)) + lag @ into[:, : flow.rates]
+            states = states @ flow.transition[k - 1].T + kick @ flow.noise_input[k - 1].T
             lag = phi[k - 1] * lag + new[k - 1] * generator.standard_normal(lag.shape)
         result[:, k] += states @ flow.seen[k].T + lag @ into[:, flow.rates :]
     return result

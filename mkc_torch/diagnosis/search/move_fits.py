@@ -1,0 +1,126 @@
+"""Fits of the search's moves, each from a known fit; all in open loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+
+from mkc_torch.diagnosis.model.fit import (
+    ROUGH,
+    SEARCH,
+    FittedModel,
+    clipped_residual,
+    fitted,
+    fitted_with_effect,
+    without_term,
+)
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.shapes import shape_fitted, with_form_of_grid
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.search.moves import STARTS, Addition
+from mkc_torch.nonlinear import NoFitError
+
+POLISHED = 2
+"""Rough fits of an effect that are refined to the end."""
+
+
+def most_likely(fits: Sequence[FittedModel]) -> FittedModel:
+    return max(fits, key=lambda fit: fit.log_likelihood)
+
+
+def at_initial_values(fit: FittedModel, away: float) -> FittedModel | None:
+    """Return a fit moved to the initial values of its parameters; None if it stayed near them.
+
+    A missing effect can drive a parameter to where no effect helps.
+
+    Args:
+        fit: of the simulation alone.
+        away: factor by which a parameter has grown or shrunk that is far.
+    """
+    prepared = fit.model.prepared
+    theta, own = prepared.start(), fit.model.base - prepared.beginnings
+    sizes = torch.stack([theta[:own], fit.parameters[:own]]).abs()
+    if not bool((sizes.amax(0) > away * sizes.amin(0)).any()):
+        return None
+    residual = fit.model.residual(theta)
+    # a clipped residual: at values that are not fitted any sample may be far
+    value, _ = clipped_residual(residual)
+    return replace(fit, parameters=theta, residual=value) if bool(residual.isfinite().all()) else None
+
+
+def fitted_through_noise(noisy: FittedModel, term: Term, size: torch.Tensor) -> FittedModel | None:
+    """Return the open-loop fit with an effect from its fit under process noise."""
+    start = torch.cat([noisy.parameters, size])
+    return fitted_with_effect(noisy, noisy.model.with_term(term), start, graduate=False, effort=SEARCH).open_loop
+
+
+def fitted_with(
+    fit: FittedModel, addition: Addition, others: Sequence[Callable[[], FittedModel | None]] = ()
+) -> FittedModel:
+    """Return the fit with one more effect, from its best shapes and from other fits."""
+    begun = sorted((_begun(fit, term, size) for term, size in addition.starts), key=lambda found: -found.log_likelihood)
+    least = 0.5 * (begun[0].log_likelihood + fit.log_likelihood)
+    near = [found for number, found in enumerate(begun[:POLISHED]) if number == 0 or found.log_likelihood >= least]
+    near += [found for other in others if (found := other()) is not None]
+    return with_form_of_grid(most_likely([_polished(found) for found in near]), SEARCH)
+
+
+def _polished(begun: FittedModel) -> FittedModel:
+    """Return a rough fit at the most likely sizes and shapes."""
+    if begun.model.terms[-1].effect.fitted_shape:
+        return shape_fitted(begun, SEARCH)
+    found = _refitted(begun, begun)
+    return begun if found is None else found
+
+
+def _begun(fit: FittedModel, term: Term, size: torch.Tensor) -> FittedModel:
+    """Return a rough fit with one more effect at a fixed shape: from its linear size, or from 0 if that is worse."""
+    model = fit.model.with_term(term)
+    found = fitted_with_effect(fit, model, torch.cat([fit.parameters, size]), graduate=False, effort=ROUGH)
+    if found.log_likelihood > fit.log_likelihood:
+        return found
+    zero = torch.cat([fit.parameters, torch.zeros_like(size)])
+    return most_likely([found, fitted_with_effect(fit, model, zero, graduate=False, effort=ROUGH)])
+
+
+def fitted_without(fit: FittedModel, number: int) -> FittedModel | None:
+    start = without_term(fit, number)
+    try:
+        return shape_fitted(fitted(start.model, start.parameters, fit.bound, graduate=False, effort=SEARCH), SEARCH)
+    except NoFitError:
+        return None
+
+
+def fitted_exchanged(fit: FittedModel, number: int, group: Sequence[Term]) -> FittedModel | None:
+    """Return the fit with another effect in place of one, from all shapes of its grid."""
+    rest = fitted_without(fit, number) if len(fit.model.terms) > 1 else _refitted(without_term(fit, number), fit)
+    if rest is None:
+        return None
+    zero = rest.parameters.new_zeros(rest.model.with_term(group[0]).size - rest.model.size)
+    return fitted_with(rest, Addition(tuple((term, zero) for term in group[:STARTS]), 0.0))
+
+
+def _refitted(start: FittedModel, like: FittedModel) -> FittedModel | None:
+    try:
+        return fitted(start.model, start.parameters, like.bound, graduate=False, effort=SEARCH)
+    except NoFitError:
+        return None
+
+
+def fitted_held(fit: FittedModel, name: str, how: str) -> FittedModel | None:
+    """Return the fit with another hold of an input; its trajectory is found again if the fit's own is too far."""
+    moved = JointModel(fit.model.prepared.with_input_hold({name: how}), fit.model.terms, fit.model.near)
+    try:
+        return shape_fitted(fitted(moved, fit.parameters, fit.bound, fresh=True))
+    except NoFitError:
+        return None
+
+
+def fitted_reordered(fit: FittedModel, terms: tuple[Term, ...]) -> FittedModel | None:
+    model = JointModel(fit.model.prepared, terms, fit.model.near)
+    try:
+        return shape_fitted(fitted(model, fit.parameters, fit.bound, graduate=False, effort=SEARCH), SEARCH)
+    except NoFitError:
+        return None
