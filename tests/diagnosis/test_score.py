@@ -138,9 +138,9 @@ def test_parts_add_up_to_the_score() -> None:
 
 
 def test_the_prices_factor_is_1_under_white_noise_and_larger_under_process_noise() -> None:
-    white, pushed = (fits(Slide(), recorded(5, jolt=jolt))[0] for jolt in (0.0, 0.3))
+    white, noisy = (fits(Slide(), recorded(5, jolt=jolt))[0] for jolt in (0.0, 0.3))
     assert basis_of(white, 10, {}, Settings()).kappa == 1.0
-    assert basis_of(pushed, 10, {}, Settings()).kappa > 1.5
+    assert basis_of(noisy, 10, {}, Settings()).kappa > 1.5
 
 
 def test_the_last_horizon_is_the_free_run() -> None:
