@@ -222,9 +222,9 @@ def score(fit: FittedModel, basis: ScoreBasis, settings: Settings, near: Sequenc
     return Score(
         by_horizon,
         basis.number * (numbers + _noise_numbers(noise)),
-        basis.choice * len(fit.model.terms),
-        settings.noise.disturbance_gain * disturbances,
-        forms,
+        basis.kappa * basis.choice * len(fit.model.terms),
+        basis.kappa * settings.noise.disturbance_gain * disturbances,
+        basis.kappa * forms,
         noise,
         per_sample(flow, noise, basis.horizons, basis.span),
     )
@@ -336,7 +336,8 @@ def _best_noise(
             )
             if any(size > basis.largest[place] for place, size, _ in scaled.components):
                 continue
-            price = settings.noise.disturbance_gain * len(noise.components) + basis.number * _noise_numbers(noise)
+            disturbances = basis.kappa * settings.noise.disturbance_gain * len(noise.components)
+            price = disturbances + basis.number * _noise_numbers(noise)
             value = float(each.mean()) - price
             if value > best[0]:
                 best = value, scaled, tuple(each.tolist())

@@ -134,7 +134,7 @@ def test_parts_add_up_to_the_score() -> None:
     assert found.terms == pytest.approx(math.log(10))
     dearer = score(friction, replace(basis, kappa=2.0 * basis.kappa), Settings())
     assert dearer is not None
-    assert dearer.value == pytest.approx(found.value - found.numbers)
+    assert dearer.value == pytest.approx(found.value - prices)
 
 
 def test_the_prices_factor_is_1_under_white_noise_and_larger_under_process_noise() -> None:

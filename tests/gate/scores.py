@@ -68,10 +68,10 @@ def free_run(fit: FittedModel, case: Case) -> float | None:
     noises = [noise for noise in grid.singles() if all(place >= flow.rates for place, _, _ in noise.components)]
     values, _ = log_likelihood_ahead(flow, noises, basis.horizons, basis.span)
     # a drift has a size and a time constant
-    drift = case.settings.noise.disturbance_gain + 2 * basis.number
+    drift = basis.kappa * case.settings.noise.disturbance_gain + 2 * basis.number
     prices = [drift * len(noise.components) for noise in noises]
     best = max(float(each.mean()) - price for each, price in zip(values, prices, strict=True))
-    own = basis.number * numbers_of(free) + basis.choice * len(model.terms)
+    own = basis.number * numbers_of(free) + basis.kappa * basis.choice * len(model.terms)
     return best - own if math.isfinite(best) else None
 
 

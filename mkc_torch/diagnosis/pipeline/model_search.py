@@ -350,7 +350,7 @@ def _as_result(located: SearchResult, step: Candidate, beam: BeamSearch) -> Sear
     terms = located.scene.terms
     others = {term.key for term in fit.model.terms[:-1]}
     rivals: dict[Key, Candidate] = {}
-    for model in beam.models.values():
+    for model in _named(list(beam.models.values()), beam.models[()]):
         more = [term.key for term in model.fit.model.terms if term.key not in others]
         if len(model.fit.model.terms) == len(others) + 1 and len(more) == 1:
             known = rivals.get(more[0])

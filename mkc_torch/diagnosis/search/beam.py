@@ -63,7 +63,7 @@ LARGER = 1.05
 """Ratio of open-loop residuals with and without an effect above which it enlarges the residual: the ratio at which
 held-out blocks reject a finding."""
 
-_PAYS = 0.5
+_PAYS = 0.25
 """Share of its price that an addition to a model with effects has to gain in the linearised model."""
 
 _NOISY = 3
@@ -303,7 +303,8 @@ class BeamSearch:
     def _price(self, term: Term, size: torch.Tensor) -> float:
         naming = self.settings.naming
         form = naming.is_generalisation * term.effect.is_generalisation + naming.nameless * term.effect.is_curve
-        return self.basis.number * (len(size) + len(term.effect.fitted_shape)) + self.basis.choice + form
+        numbers = len(size) + len(term.effect.fitted_shape)
+        return self.basis.number * numbers + self.basis.kappa * (self.basis.choice + form)
 
     def _id(self, term: Term) -> str:
         return suspect_id(term, self.terms)
