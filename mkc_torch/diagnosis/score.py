@@ -255,7 +255,7 @@ def separation(best: Score | None, other: Score | None, basis: ScoreBasis) -> fl
     away = best.per_sample - other.per_sample
     away = away - away.mean()
     error = math.sqrt(float(away @ away) * variance_ratio([away], len(away) // 10))
-    return min(gap / basis.kappa, 0.5 * gap * abs(gap) / max(error, 1e-300) ** 2)
+    return min(gap / basis.kappa, 0.5 * gap * abs(gap) / error**2) if error > 0.0 else gap / basis.kappa
 
 
 def _noise_numbers(noise: NoiseModel) -> int:

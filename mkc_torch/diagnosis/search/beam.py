@@ -63,7 +63,7 @@ LARGER = 1.05
 """Ratio of open-loop residuals with and without an effect above which it enlarges the residual: the ratio at which
 held-out blocks reject a finding."""
 
-_PAYS = 0.25
+_PAYS = 0.1
 """Share of its price that an addition to a model with effects has to gain in the linearised model."""
 
 _NOISY = 3
