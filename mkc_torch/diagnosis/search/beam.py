@@ -63,7 +63,7 @@ LARGER = 1.05
 """Ratio of open-loop residuals with and without an effect above which it enlarges the residual: the ratio at which
 held-out blocks reject a finding."""
 
-_PAYS = 0.1
+_PAYS = 0.5
 """Share of its price that an addition to a model with effects has to gain in the linearised model."""
 
 _NOISY = 3
@@ -301,10 +301,11 @@ class BeamSearch:
         return [*first, *others[: max(most - len(first), most // 2)]]
 
     def _price(self, term: Term, size: torch.Tensor) -> float:
+        """Return the price of an effect next to a linear gain, a likelihood of one horizon."""
         naming = self.settings.naming
         form = naming.is_generalisation * term.effect.is_generalisation + naming.nameless * term.effect.is_curve
         numbers = len(size) + len(term.effect.fitted_shape)
-        return self.basis.number * numbers + self.basis.kappa * (self.basis.choice + form)
+        return self.basis.number / self.basis.kappa * numbers + self.basis.choice + form
 
     def _id(self, term: Term) -> str:
         return suspect_id(term, self.terms)
