@@ -335,7 +335,7 @@ def _final(step: Candidate, beam: BeamSearch, options: SearchOptions, *, last: b
     # tests of evidence need residuals that are white under the noise; a lag of a sensor is exact in open loop only
     gained = step.value - beam.models[()].value
     less = max(options.settings.naming.separable * beam.basis.kappa, _KEPT * gained)
-    whole = beam.to_the_end(step)
+    whole = beam.simplified(beam.to_the_end(step))
     whole = beam.with_best_hold(whole, options.fixed) if last else whole
     noisy = beam.under_noise(whole, less)
     if noisy is not whole or has_process_noise(whole.fit):

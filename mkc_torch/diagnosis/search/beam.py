@@ -27,6 +27,7 @@ from mkc_torch.diagnosis.search.move_fits import (
     fitted_exchanged,
     fitted_held,
     fitted_reordered,
+    fitted_simpler,
     fitted_through_noise,
     fitted_with,
     fitted_without,
@@ -361,6 +362,17 @@ class BeamSearch:
                 if name not in fixed and other != how:
                     held = fitted_held(model.fit, name, other)
                     model = model if held is None else self._better(model, held)
+        return model
+
+    def simplified(self, model: Candidate) -> Candidate:
+        """Return a model with the simpler forms of its effects that this recording cannot separate from it."""
+        for number in range(len(model.fit.model.terms)):
+            other = fitted_simpler(model.fit, number)
+            model = (
+                model
+                if other is None
+                else self._better(model, other, self.settings.naming.separable * self.basis.kappa)
+            )
         return model
 
     def to_the_end(self, model: Candidate) -> Candidate:

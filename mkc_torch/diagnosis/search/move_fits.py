@@ -18,6 +18,7 @@ from mkc_torch.diagnosis.model.fit import (
 )
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import shape_fitted, with_form_of_grid
+from mkc_torch.diagnosis.model.simpler import simpler_start
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.moves import STARTS, Addition
 from mkc_torch.nonlinear import NoFitError
@@ -122,5 +123,14 @@ def fitted_reordered(fit: FittedModel, terms: tuple[Term, ...]) -> FittedModel |
     model = JointModel(fit.model.prepared, terms, fit.model.near)
     try:
         return shape_fitted(fitted(model, fit.parameters, fit.bound, graduate=False, effort=SEARCH), SEARCH)
+    except NoFitError:
+        return None
+
+
+def fitted_simpler(fit: FittedModel, number: int) -> FittedModel | None:
+    """Return the fit with the simpler form of an effect, such as equal exchange of two states; None without that."""
+    start = simpler_start(fit, number) if fit.model.terms[number].effect.simpler is not None else None
+    try:
+        return None if start is None else shape_fitted(fitted(*start, fit.bound, graduate=False))
     except NoFitError:
         return None
