@@ -130,9 +130,9 @@ class SearchSettings(_Stage):
             which the rejection may hide the effect. The effect is then tested by tangents at the fit with it,
         smaller: unless the scale with the effect, relative to that without, is above this limit.
         doubted: nats beyond all surrogates up to which surrogates of other plausible noise are drawn too.
-        own_noise: number of leading candidates that are refitted and compared, each under its own remaining process
-            noise.
-        behind: nats behind the best first fit from which a candidate is not refitted or reshaped, added to
+        own_noise: number of leading candidates of the screening under process noise from which models of differential
+            equations are searched first.
+        behind: nats behind the best first fit from which a candidate is not reshaped, added to
         behind_share: this share of the best gain. Set on a simulated cart and a servo, where such candidates ended 90
             to 430 nats behind.
         stretches: number of equal stretches in a recording.

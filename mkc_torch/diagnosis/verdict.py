@@ -50,7 +50,7 @@ EXPLAINS_MORE = "simulation_explains_more"
 _RESERVATIONS: Mapping[str, DiagnosisDoubt] = {"smaller_residual": "not_better", "few_rejected": "much_rejected"}
 """Doubt of each rule that leaves the verdict unchanged."""
 
-_NAMED: tuple[Grade, ...] = ("left_out", "small")
+NAMED: tuple[Grade, ...] = ("left_out", "small")
 """Grades of findings that explain the residual."""
 
 
@@ -255,7 +255,7 @@ def verdict_of(trail: Trail) -> Verdict:
     failed, grades = failed_rules(trail), grades_of(trail)
     if UNFIT in failed:
         return "unfit"
-    if set(failed) - set(_RESERVATIONS) or any(found not in _NAMED for found in grades):
+    if set(failed) - set(_RESERVATIONS) or any(found not in NAMED for found in grades):
         return "unexplained"
     return "explained" if grades else "adequate"
 
@@ -264,7 +264,7 @@ def doubted_signs(trail: Trail) -> str:
     """Return that the correction explains more than the simulation, if nothing else is unexplained; else empty."""
     failed = failed_rules(trail)
     alone = set(failed) - set(_RESERVATIONS) == {EXPLAINS_MORE}
-    return failed[EXPLAINS_MORE] if alone and all(found in _NAMED for found in grades_of(trail)) else ""
+    return failed[EXPLAINS_MORE] if alone and all(found in NAMED for found in grades_of(trail)) else ""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics, Parameter
 from tests.shared_data import shared_data
 
-QUICK = {"surrogates": 19, "max_findings": 1}
+QUICK = {"surrogates": 39, "max_findings": 1}
 NOISE = 0.01
 
 

@@ -82,7 +82,7 @@ def test_the_terms_of_the_trail_are_suspects():
     fit = fitted_pendulum().fit
     terms = candidates(fit, EFFECTS)
     models = quick_look().decisions.models
-    assert [len(model.terms) for model in models] == [0, 1]  # the simulation alone, and with the finding
+    assert [len(model.terms) for model in models[:2]] == [0, 1]  # the simulation alone comes first
     for name in {name for model in models for name in model.terms}:
         (group,) = suspected_terms(name, terms, fit.model.prepared)
         assert len({term.key for term in group}) == 1

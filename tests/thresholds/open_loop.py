@@ -2,16 +2,15 @@
 
 Simulated recordings of a ship's turn, a circuit, a basin and a sled, with hidden physics, white noise of the sensor and
 a lasting disturbance or slow error of the sensor. No other test or recording of the project has these systems. Each
-recording is searched as `mkc diagnose` does, up to the comparison with a special case; a recording in which nothing
-is hidden, up to its open-loop fits. Writes `DIR/draws.json` and prints the error rates of the thresholds. For each
-candidate: whether it is right, the ratio of its open-loop residual to that of the simulation alone, and its gain by the
-residual's correlation beyond Schwarz's penalty. A run into the same folder continues an interrupted run.
+recording is searched as `mkc diagnose` does, for models with one effect. Writes `DIR/draws.json` and prints the error
+rates of the thresholds. For each model: whether its effect is right, its score, the ratio of its open-loop residual to
+that of the simulation alone, and its gain by the residual's correlation beyond Schwarz's penalty. A run into the same
+folder continues an interrupted run.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import math
 import sys
@@ -20,18 +19,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mkc_torch.diagnosis.evidence.held_out import gain_interval
+from mkc_torch.diagnosis.goodness_of_fit import size_of
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.process_noise import fit_alone
+from mkc_torch.diagnosis.model.shapes import candidates_of
 from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
-from mkc_torch.diagnosis.pipeline import stepwise
-from mkc_torch.diagnosis.search import ranking as ranks
-from mkc_torch.diagnosis.search import with_process_noise
+from mkc_torch.diagnosis.score import basis_of
+from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate
+from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.effects import CATALOGUE
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation import Dynamics, Parameter
 
@@ -191,73 +193,49 @@ def _slow(random: np.random.Generator, share: float) -> Array:
     return series
 
 
-class _SearchStoppedError(Exception):
-    """Stops the search once its statistics are collected."""
-
-
 def search_statistics(name: str, hidden: str, seed: int) -> dict[str, Any]:
-    """Search a recording up to the comparison with a special case, and return the statistics that its rules use."""
-    from mkc_torch import diagnose
-
+    """Fit the models with one effect, as the search does, and return their statistics, highest score first."""
     right = SAME.get(hidden, (hidden, "power_law"))
-    row: dict[str, Any] = {"system": name, "hidden": hidden, "seed": seed, "free": [], "paying": [], "special": []}
-    free_runs = with_process_noise.free_runs
-
-    def described(run: Any, free: Any) -> dict[str, Any]:
-        effect = run.model.terms[-1].effect
-        price = 0.5 * (run.model.sizes[-1] + len(effect.fitted_shape)) * math.log(len(run.residual))
-        return {
-            "effect": effect.id,
-            "right": effect.id in right,
-            "ratio": math.exp(ranks._size(run) - ranks._size(free)),
-            "gain": agreed_innovation_gain(free.residual, run.residual) - price,
-        }
-
-    def free(alone: Any, terms: Any, settings: Any) -> Any:
-        runs = free_runs(alone, terms, settings)
-        row["free"] = [described(run, alone) for _, run in runs.fits]
-        if hidden == NOTHING:
-            raise _SearchStoppedError
-        return runs
-
-    def open_loop(best: Any, ranking: Any, rivals: Any, alone: Any, runs: Any, terms: Any) -> Any:
-        known = {terms[number].key: fit for number, fit in runs.items()}
-        for fit in (best, *(fit for fit in rivals if fit is not best)):
-            own = [ranks.refit_open_loop(fit), known.get(fit.model.terms[-1].key)]
-            finite = [run for run in own if run is not None]
-            if finite:
-                row["paying"].append(described(min(finite, key=ranks._size), alone))
-        return ranks.with_open_loop_gain(best, ranking, rivals, alone, runs, terms)
-
-    def special(located: Any, scores: Any, blocks: Any, seed: int, settings: Any) -> Any:
-        gaps = {located.scene.terms[rival.number].key: rival.gap for rival in located.ranking}
-        effect, port = located.term.effect, located.term.port
-        row["claimed"] = effect.id
-        for fit in located.compared if effect.is_generalisation else ():
-            other = fit.model.terms[-1]
-            if other.port == port and not (other.effect.is_generalisation or other.effect.is_curve):
-                gain = scores(located.fit).log_likelihood - scores(fit).log_likelihood
-                _, (low, _) = gain_interval(gain, blocks.block, torch.Generator().manual_seed(seed))
-                row["special"].append({"effect": other.effect.id, "gap": gaps[other.key], "low": low})
-        raise _SearchStoppedError
-
+    settings, simulation = Settings(), SYSTEMS[name][0]()
     begin = time.process_time()
-    with (
-        mock.patch.object(with_process_noise, "free_runs", free),
-        mock.patch.object(with_process_noise, "with_open_loop_gain", open_loop),
-        mock.patch.object(stepwise, "with_special_case", special),
-        contextlib.suppress(_SearchStoppedError),
-    ):
-        diagnose(SYSTEMS[name][0](), drawn(name, hidden, seed), surrogates=19, max_findings=1)
-    return row | {"cpu_seconds": round(time.process_time() - begin, 1)}
+    baseline = fit_alone(simulation.prepare(drawn(name, hidden, seed)), {}, settings.noise)
+    start = baseline.fit if baseline.free is None else baseline.free
+    terms = candidates_of(simulation, start.model.prepared.open_loop(), CATALOGUE, settings.drivers)[1]
+    basis = basis_of(baseline.fit, len({term.key for term in terms}), {}, settings)
+    beam = BeamSearch(terms, basis, settings, {}, most_terms=1)
+    best = beam.run(start)
+    claimed = [term.effect.id for term in best.fit.model.terms]
+    models = sorted(beam.models.values(), key=lambda model: -model.value)
+    return {
+        "system": name,
+        "hidden": hidden,
+        "seed": seed,
+        "claimed": claimed[0] if claimed else NOTHING,
+        "models": [_described(model, start, right) for model in models if model.fit.model.terms],
+        "cpu_seconds": round(time.process_time() - begin, 1),
+    }
+
+
+def _described(model: Candidate, alone: FittedModel, right: Sequence[str]) -> dict[str, Any]:
+    """Return the statistics of a model with one effect."""
+    fit = model.fit
+    effect = fit.model.terms[-1].effect
+    price = 0.5 * (fit.model.sizes[-1] + len(effect.fitted_shape)) * math.log(len(fit.residual))
+    return {
+        "effect": effect.id,
+        "right": effect.id in right,
+        "score": model.value,
+        "ratio": math.exp(float((size_of(fit.residual) / size_of(alone.residual)).log().mean())),
+        "gain": agreed_innovation_gain(alone.residual, fit.residual) - price,
+    }
 
 
 def rates(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Lines with the error rates of each threshold at several values; each counts recordings."""
-    empty = [row["free"] for row in rows if row["hidden"] == NOTHING and row["free"]]
+    empty = [row["models"] for row in rows if row["hidden"] == NOTHING and row["models"]]
     there = [row for row in rows if row["hidden"] != NOTHING]
-    leading = [row["paying"] for row in there if row["paying"]]
-    known = [[c for c in row["free"] if c["right"]] for row in there]
+    leading = [row["models"] for row in there if row["models"]]
+    known = [[c for c in row["models"] if c["right"]] for row in there]
     known = [fits for fits in known if fits]
     for limit in (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98):
         chance = sum(any(c["ratio"] < limit for c in fits) for fits in empty)
@@ -273,22 +251,9 @@ def rates(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         chance = sum(any(c["gain"] > nats for c in fits) for fits in empty)
         missed = sum(all(c["gain"] <= nats for c in fits) for fits in known)
         yield f"gain {nats}: by chance above {chance}/{len(empty)}, hidden effect not above {missed}/{len(known)}"
-    for nats in (4.5, 9.0, 13.5, 18.0):
-        near = [
-            p["gap"] >= nats
-            for row in there
-            for p in row["special"]
-            if (row["hidden"], p["effect"]) == (THIN, "quadratic_drag")
-        ]
-        taken = [
-            any(p["gap"] < nats and p["low"] <= 0.0 for p in row["special"])
-            for row in there
-            if row.get("claimed") == row["hidden"] and row["special"]
-        ]
-        yield (
-            f"reach {nats}: drag in thinning air out of reach {sum(near)}/{len(near)}, "
-            f"hidden general form replaced {sum(taken)}/{len(taken)}"
-        )
+    named = sum(row["claimed"] in {c["effect"] for c in row["models"] if c["right"]} for row in there)
+    false = sum(row["claimed"] != NOTHING for row in rows if row["hidden"] == NOTHING)
+    yield f"highest score: hidden effect {named}/{len(there)}; an effect by chance {false}/{len(rows) - len(there)}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -40,7 +40,7 @@ class EvidenceContext:
         number: of the finding, in a test of each finding.
         estimate: the final parameters; None in ``ahead`` functions.
         ahead: result of the test's ``ahead`` function.
-        pairs: scores without and with each finding under the same process noise, by which it was confirmed.
+        pairs: scores without and with each finding in the search, by which it was confirmed.
     """
 
     base: FittedModel

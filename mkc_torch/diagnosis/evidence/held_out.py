@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -149,17 +149,3 @@ def gain_interval(
     tail = 0.5 * (1.0 - coverage)
     low, high = torch.quantile(means, torch.tensor([tail, 1.0 - tail], dtype=means.dtype)).tolist()
     return float(difference.mean()), (low, high)
-
-
-def better_supported(before: Evidence, ways: Sequence[Evidence], blocks: HeldOutBlocks, seed: int) -> Evidence:
-    """Return the evidence with the larger lower limit of the gain.
-
-    The finding is tested under the process noise of the model without it, and under the process noise that remains with
-    it. The first noise absorbs as much of the finding as it can; under the second, few samples can dominate.
-    """
-
-    def least(after: Evidence) -> float:
-        difference = after.log_likelihood - before.log_likelihood
-        return gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))[1][0]
-
-    return max(ways, key=least)

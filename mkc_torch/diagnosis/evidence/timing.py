@@ -225,7 +225,7 @@ def shifted(model: JointModel, located: SearchResult) -> DriverShift | None:
     pointwise = located.scene.tangents.pointwise[term.port]
     N = len(located.scene.values)
     most = int(located.scene.settings.evidence.shift * N)
-    if term.driver is None or pointwise is None or model.prepared.ports[term.port].clock is not None:
+    if term.driver is None or pointwise is None:
         return None
     if N - 2 * most < _FEWEST:
         return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,12 +15,11 @@ from mkc_torch.density import fit_density
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted, no_first_fit
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.first_fit import multiple_shooting_start, with_strong_observer
-from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, most_likely_noise, noise_of
+from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, most_likely_noise
 from mkc_torch.simulation.dynamics.other_starts import other_starts
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.protocol import PreparedSimulation
@@ -69,11 +67,6 @@ class ProcessNoiseFit:
         """Whether the noise contains more than the sensors' white noise."""
         return self.noise is not None and self.noise.observer is not None
 
-    @property
-    def disturbance_count(self) -> int:
-        """Number of disturbances in the noise."""
-        return 0 if self.noise is None else len(self.noise.selected.disturbances)
-
 
 def first_samples(prepared: PreparedSimulation) -> Tensor | None:
     """Mask the samples that determine a run's initial states; None for a simulation without states."""
@@ -94,12 +87,6 @@ def has_only_drift(fit: FittedModel) -> bool:
     """Whether a fit has drift but no process noise, so that its parameters are those of an open-loop fit."""
     observer = fit.model.prepared.observer
     return observer is not None and not any(disturbance.at_rate for disturbance in observer.disturbances)
-
-
-def noise_of_fit(fit: FittedModel, declared: Mapping[str, float]) -> StateSpaceNoise | None:
-    """Return the noise model of a fit; None for a simulation without states."""
-    system = fit.model.prepared.dynamics
-    return None if system is None else noise_of(system, declared)
 
 
 def estimate_noise(
@@ -263,54 +250,6 @@ def with_noise_around(fit: FittedModel, declared: Mapping[str, float], settings:
     )
 
 
-def refit_noise(
-    fit: FittedModel,
-    around: StateSpaceNoise | None,
-    declared: Mapping[str, float],
-    settings: NoiseSettings,
-    least: float = -math.inf,
-) -> FittedModel:
-    """Refit a joint model under its remaining process noise, or in open loop if that is as likely.
-
-    ``least`` is the log-likelihood that matters: where both are below it, the slower comparison of the two is left out.
-    """
-    found = _under_noise(fit, estimate_noise(fit, declared, settings, around), declared, settings)
-    best = fit if found is None or found[0].log_likelihood < fit.log_likelihood else found[0]
-    free = refit_open_loop(best)
-    if free is None or max(best.log_likelihood, free.log_likelihood) <= least:
-        return best
-    # parameters fitted under a disturbance can depend on it; those of the open-loop fit do not
-    left = estimate_noise(free, declared, settings)
-    if left is None or left.observer is None or free.log_likelihood > best.log_likelihood:
-        return free
-    return best
-
-
-def refit_input_hold(
-    fit: FittedModel, declared: Mapping[str, float], fixed: Mapping[str, str], settings: NoiseSettings
-) -> FittedModel:
-    """Return the fit with the most likely holds of its inputs, given its effects.
-
-    Without the effects, another hold may have replaced them. The trajectory under another hold can be too far from the
-    fit's own to be solved from there.
-    """
-    prepared = fit.model.prepared
-    for name, how in prepared.input_hold.items():
-        for other in ("held", "linear"):
-            if name in fixed or other == how:
-                continue
-            moved = JointModel(prepared.with_input_hold({name: other}), fit.model.terms, fit.model.near)
-            try:
-                under = fitted(moved, fit.parameters, fit.bound, fresh=True)
-            except NoFitError:
-                continue
-            around = noise_of_fit(under, declared)
-            found = refit_noise(shape_fitted(under), around, declared, settings, fit.log_likelihood)
-            if found.log_likelihood > fit.log_likelihood:
-                fit, prepared = found, found.model.prepared
-    return fit
-
-
 def refit_open_loop(fit: FittedModel) -> FittedModel | None:
     """Return the open-loop fit of the same joint model; None if that loses the recording."""
     return fit.open_loop
@@ -393,23 +332,28 @@ def _from_given(
 
 
 def choose_input_hold(
-    base: ProcessNoiseFit, declared: Mapping[str, float], fixed: Mapping[str, str], settings: NoiseSettings
+    base: ProcessNoiseFit,
+    declared: Mapping[str, float],
+    fixed: Mapping[str, str],
+    settings: NoiseSettings,
+    value: Callable[[ProcessNoiseFit], float],
 ) -> ProcessNoiseFit:
-    """Return the fit with the most likely hold of each input, constant or linear between samples.
+    """Return the fit with the best hold of each input, constant or linear between samples.
 
     Args:
         base: the fit with the simulation's own holds.
         declared: known standard deviations of the outputs' white noise.
         fixed: inputs whose hold is known.
         settings: of the noise.
+        value: the score of a fit.
     """
     prepared = base.fit.model.prepared.open_loop()
     for name, how in prepared.input_hold.items():
         others = [hold for hold in ("held", "linear") if hold != how] if name not in fixed else []
         works = [partial(_holding, base, name, other, declared, settings) for other in others]
         tried = [found for found in run_parallel(works, prepared) if found is not None]
-        least = settings.disturbance_gain
-        base = max([base, *tried], key=lambda fits: fits.fit.log_likelihood - least * fits.disturbance_count)
+        if tried:
+            base = max([base, *tried], key=value)
     return _with_sizes(base)
 
 

@@ -281,12 +281,13 @@ def shape_fitted(fit: FittedModel, effort: Effort = FULL) -> FittedModel:
         return fit
     try:
         both = fitted(model, model.start(fit.parameters), fit.bound, graduate=False, effort=effort)
-        terms = [_with_plain_shape(term) for term in model.shaped(both.parameters)]
-        moved = JointModel(model.prepared, terms, both.model.near)
-        again = fitted(moved, both.parameters[: model.joint], fit.bound, graduate=False, effort=effort)
     except NoFitError:
         return fit
-    return again if again.log_likelihood > fit.log_likelihood else fit
+    if not both.log_likelihood > fit.log_likelihood:
+        return fit
+    terms = [_with_plain_shape(term) for term in model.shaped(both.parameters)]
+    moved = JointModel(model.prepared, terms, both.model.near)
+    return replace(both, model=moved, parameters=both.parameters[: model.joint])
 
 
 def _with_plain_shape(term: Term) -> Term:
@@ -353,7 +354,7 @@ def _at_next(fit: FittedModel, name: str, grid: Sequence[float], steps: int, eff
 def _varied(fit: FittedModel) -> Iterator[Term]:
     """Yield the last effect with each of its delays and lags varied, within the limits."""
     term, prepared = fit.model.terms[-1], fit.model.prepared
-    if prepared.ports[term.port].kind != "input" or prepared.dynamics is None:
+    if prepared.ports[term.port].kind != "input":
         return
     for name, (low, high) in reach_of(term, prepared).items():
         if name in term.effect.continuous:

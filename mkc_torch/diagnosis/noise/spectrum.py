@@ -51,12 +51,8 @@ class NoiseSpectrum:
     def order(self) -> int:
         return max(len(c) for c in self.coefficients)
 
-    def whiten(self, values: Float[Tensor, "N m *rest"]) -> Float[Tensor, Km * rest]:
-        """Return the slowest cosine coefficients over the root of the spectrum, K of each channel, channels stacked."""
-        return self.scaled(dct(values, len(self.root)))
-
     def scaled(self, coefficients: Float[Tensor, "K m *rest"]) -> Float[Tensor, Km * rest]:
-        """Whiten values that are in the cosine basis already."""
+        """Return cosine coefficients divided by the root of the spectrum, channels stacked."""
         root = self.root.reshape(*self.root.shape, *[1] * (coefficients.dim() - 2)).to(coefficients.dtype)
         return (coefficients / root).flatten(0, 1)
 

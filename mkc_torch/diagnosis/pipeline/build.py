@@ -36,7 +36,14 @@ from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Finding, Separ
 from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import NamingSettings, NoiseSettings
-from mkc_torch.diagnosis.verdict import FitAssessment, Remainder, decisions_on_all, reservations_of, verdict_of
+from mkc_torch.diagnosis.verdict import (
+    NAMED,
+    FitAssessment,
+    Remainder,
+    decisions_on_all,
+    reservations_of,
+    verdict_of,
+)
 from mkc_torch.diagnosis.vetoes import VetoContext, decisions_on, grade, is_dropped
 from mkc_torch.recording.unit_warnings import unit_warnings
 from mkc_torch.simulation.dynamics.noise import sized_noise
@@ -151,6 +158,10 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
     unfit = known.unfit(settings.evidence)
     count = 0 if unfit else len(case.found)
     graded = [_graded(case.found, number, final, whole, answers) for number in range(count)]
+    without = replace(known, corrected=())
+    if without.unfit(settings.evidence) and not any(finding.grade in NAMED for finding, _ in graded):
+        # a correction that is not to be used makes no simulation usable
+        unfit, known, graded = True, without, []
     findings = tuple(finding for finding, decided in graded if not is_dropped(decided))
     without_size = tuple(finding for finding, decided in graded if is_dropped(decided))
     diagnosis = Diagnosis(

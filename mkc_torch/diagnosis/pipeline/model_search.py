@@ -9,7 +9,9 @@ from dataclasses import replace
 
 import torch
 
+from mkc_torch.diagnosis.environment import GoodnessOfFit
 from mkc_torch.diagnosis.evidence.held_out import Evidence, blocks_of, gain_interval, held_out, on_all
+from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, poor_fits, size_of
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.process_noise import (
@@ -23,12 +25,12 @@ from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
-from mkc_torch.diagnosis.pipeline.scores import wrong_column
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.pipeline.suspected import suspected_models
 from mkc_torch.diagnosis.pipeline.trail import trail_of
 from mkc_torch.diagnosis.score import basis_of, score, separation
 from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate, in_order
+from mkc_torch.diagnosis.search.columns import best_change
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.search.screening import screened
@@ -95,7 +97,7 @@ def search_models(
     keep(search)
     if options.max_findings == 0:
         return replace(search, left=())
-    column = wrong_column(beam, base, options)
+    column = _wrong_column(beam, base, options)
     if column:
         return replace(search, left=(), column=column)
     if first.p_value > options.level:
@@ -151,6 +153,30 @@ def _beam(base: ProcessNoiseFit, first: SearchResult, terms: tuple[Term, ...], o
         return beam
     beam.run(start, leaders if significant else ())
     return beam
+
+
+def _wrong_column(beam: BeamSearch, base: ProcessNoiseFit, options: SearchOptions) -> str:
+    """Return the column whose other sign or unit scores clearly higher than any effect, in a sentence; else empty."""
+    if options.quick:
+        return ""
+    settings, fits = options.settings, [fit for fit in (base.free, base.fit) if fit is not None]
+    poor = bool(poor_fits(_goodness(fits[0]), settings.evidence.followed))
+    found = best_change(fits, beam.basis, settings, poor=poor)
+    if found is None or poor_fits(_goodness(found.fit), settings.evidence.followed):
+        return ""
+    gain = (found.value - beam.best.value) / beam.basis.kappa
+    if not gain > settings.naming.separable:
+        return ""
+    sizes = dict(zip(found.fit.model.prepared.channels, size_of(found.fit.residual).tolist(), strict=True))
+    reached = ", ".join(f"{name} {size:.3g}" for name, size in sizes.items())
+    return (
+        f"With the {found.change.sentence} the simulation scores {gain:.0f} nats more than with any effect; the "
+        f"open-loop residual is then {reached}."
+    )
+
+
+def _goodness(fit: FittedModel) -> tuple[GoodnessOfFit, ...]:
+    return goodness_of_fit(fit.model.prepared, fit.residual, {}, None)
 
 
 def _in_turn(beam: BeamSearch) -> list[list[Candidate]]:
@@ -229,9 +255,7 @@ def _tested(
         alike = (base.free is None) == (step.fit.open_loop is None)
         if number == 0 and options.judged and alike and _refused(search.evidence[0], after, search, options):
             return replace(search, unconfirmed=located)
-        pairs = (*search.pairs, (search.evidence[-1], after))
-        evidence = (*search.evidence, after)
-        search = replace(search, found=(*search.found, located), evidence=evidence, pairs=pairs, left=())
+        search = replace(search, found=(*search.found, located), evidence=(*search.evidence, after), left=())
         suspected = (model for model in search.models if model.suspected)
         search = replace(search, models=(*trail_of(beam, step.fit), *suspected))
         keep(search)
@@ -256,8 +280,7 @@ def with_step_of(search: StepwiseSearch, base: ProcessNoiseFit, options: SearchO
             fit = fit_with_process_noise(fit, options.declared, options.settings.noise).fit
         found.append(replace(located, fit=fit, term=fit.model.terms[-1]))
         evidence.append(_evidence(search, fit, options))
-    pairs = tuple(itertools.pairwise(evidence))
-    return replace(search, found=tuple(found), evidence=tuple(evidence), pairs=pairs)
+    return replace(search, found=tuple(found), evidence=tuple(evidence))
 
 
 def _left(fit: FittedModel, beam: BeamSearch) -> tuple[Term, ...]:

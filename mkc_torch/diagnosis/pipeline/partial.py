@@ -230,7 +230,7 @@ def cut_short(known: PartialResult, reason: Reason, seconds: float, limit: float
     judged = len(search.evidence) == len(found) + 1
     if not judged:
         fits = known.base, *(located.fit for located in found)
-        search = replace(search, evidence=tuple(on_all(fit) for fit in fits), pairs=())
+        search = replace(search, evidence=tuple(on_all(fit) for fit in fits))
     search = replace(search, found=found)
     unjudged = partial(running_unjudged, known.base, known.fitted_baseline.free, found)
     free = within(_MOMENT_S, partial(known.open_loop_findings, search) if judged else unjudged)

@@ -10,7 +10,6 @@ from mkc_torch.diagnosis.model.shapes import described
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.result import Diagnosis
-from mkc_torch.diagnosis.search.ranking import is_hardly_visible
 from mkc_torch.diagnosis.search.run import SearchResult
 
 _HINTED = 0.15
@@ -51,12 +50,10 @@ def _not_confirmed(located: SearchResult, diagnosis: Diagnosis) -> str:
 
 
 def _refused(located: SearchResult, diagnosis: Diagnosis) -> str:
-    why = (
-        "it turns the sensor's vector far more than it changes its length, so its size is not determined and it"
-        if is_hardly_visible(located.fit)
-        else "the open-loop residual is larger with it, so it"
+    return (
+        f"{_rejected(located, diagnosis)}, but it turns the sensor's vector far more than it changes its length, so "
+        "its size is not determined and it does not count as a finding."
     )
-    return f"{_rejected(located, diagnosis)}, but {why} does not count as a finding."
 
 
 def _rejected(located: SearchResult, diagnosis: Diagnosis) -> str:

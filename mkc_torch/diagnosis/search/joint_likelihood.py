@@ -19,7 +19,7 @@ from mkc_torch._support.quantum import rounding_of
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.likelihoods import PRICE, Columns, Limits, LogLikelihoods, log_likelihoods
-from mkc_torch.diagnosis.search.significance import COUNTS, COUNTS_NOT
+from mkc_torch.diagnosis.search.significance import COUNTS, COUNTS_NOT, best_rank_p_value
 from mkc_torch.diagnosis.search.significance import price as price_of_candidate
 from mkc_torch.diagnosis.search.tangents import ModelTangents
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
@@ -88,7 +88,7 @@ class JointLikelihood:
         p_value: of the strongest candidate after the whole search, the largest over the kinds of noise.
         beyond: nats by which it exceeds the strongest surrogate.
         needed: (C,), gains in nats at which the p-value would equal the level.
-        noise: the most likely noise with each candidate; ``without`` that of the simulation without a candidate.
+        noise: the most likely noise with each candidate.
         scene: the linearised recording.
     """
 
@@ -98,7 +98,6 @@ class JointLikelihood:
     beyond: float
     needed: Float[Tensor, " C"]
     noise: tuple[NoiseModel, ...]
-    without: NoiseModel
     scene: _LinearisedRecording
 
     @property
@@ -239,7 +238,6 @@ def joint_likelihood(
         float(beyond),
         torch.from_numpy(needed),
         tuple(found.models[int(number)] for number in found.with_candidate[:, :, 0].argmax(0)),
-        found.models[best],
         scene,
     )
 
@@ -368,10 +366,13 @@ def _surrogate_test(
     """Return the p-value, nats beyond all surrogates, and the gains whose p-value would equal the level.
 
     Surrogates follow a noise model, with the sizes of the innovations given the strongest candidate, so that they do
-    not contain the missing effect; each innovation has a random sign.
+    not contain the missing effect; each innovation has a random sign. Two statistics are compared, the largest gain
+    with each candidate's own noise and the largest gain in the open loop, and the p-value is that of the better rank:
+    process noise can follow one sample ahead what only physics follows in the open loop.
     """
-    gained = np.zeros((len(found.rank), 0))
+    gained, free = np.zeros((len(found.rank), 0)), np.zeros((len(found.rank), 0))
     own = found.with_candidate[:, :, 0].max(0) - found.without[:, 0].max()
+    own_free = found.with_candidate[0, :, 0] - found.without[0, 0]
     near = found.near_the_best(_FAR_BEHIND)
     for count in (min(_FIRST_DRAWS, draws), draws - min(_FIRST_DRAWS, draws)):
         if not count:
@@ -380,14 +381,23 @@ def _surrogate_test(
         near = some.near_the_best(_HOPELESS)
         drawn = some.with_candidate[:, :, 1:].max(0) - some.without[:, 1:].max(0)
         gained = np.concatenate([gained, drawn], 1)
-        usual = np.quantile(gained, _USUAL, axis=1, keepdims=True)
-        strongest = (gained - usual).max(0)
-        here = float((own - usual[:, 0]).max())
-        as_much = int((strongest >= here).sum())
+        free = np.concatenate([free, some.with_candidate[0, :, 1:] - some.without[0, 1:]], 1)
+        here, strongest, usual = _beyond_usual(own, gained)
+        here_free, strongest_free, _ = _beyond_usual(own_free, free)
+        as_much = min(int((strongest >= here).sum()), int((strongest_free >= here_free).sum()))
         if as_much >= _ENOUGH:
             break
-    needed = usual[:, 0] + np.quantile(strongest, 1.0 - level)
-    return (1.0 + as_much) / (1.0 + gained.shape[1]), here - float(strongest.max()), needed
+    needed = usual + np.quantile(strongest, 1.0 - level)
+    ranked = [torch.from_numpy(np.concatenate([[a], b])) for a, b in ((here, strongest), (here_free, strongest_free))]
+    return best_rank_p_value(*ranked), here - float(strongest.max()), needed
+
+
+def _beyond_usual(
+    own: Float[np.ndarray, " C"], drawn: Float[np.ndarray, "C S"]
+) -> tuple[float, Float[np.ndarray, " S"], Float[np.ndarray, " C"]]:
+    """Return the largest gain beyond what each candidate usually gains: for recording and surrogates; and the usual."""
+    usual = np.quantile(drawn, _USUAL, axis=1, keepdims=True)
+    return float((own - usual[:, 0]).max()), (drawn - usual).max(0), usual[:, 0]
 
 
 def _drawn(

@@ -14,7 +14,6 @@ from torch import Tensor
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.diagnosis.model.fit import FittedModel, clipped_residual, fitted_with_effect
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
 from mkc_torch.diagnosis.search.linearise import linearise
 from mkc_torch.diagnosis.search.problem import CandidateSearch, refined
@@ -45,7 +44,7 @@ def strongest(
 
     Candidates are ranked by the likelihood's own score and by a clipped score, which still sees a stretch of samples
     that the fit rejects. In case one model of the whole recording diverges, they are also ranked at fits to parts of
-    the recording, and at the initial values of its fit.
+    the recording.
     """
     around = base.parameters
     noise, search = settings.noise, settings.search
@@ -69,11 +68,10 @@ def strongest(
         ]
         more = [
             _short_list(base, terms, start, tangents_of(base.model, start[0], noise, terms), search.refitted_elsewhere)
-            for start in (*started, *_first_start(base, search.ran_away))
+            for start in started
         ]
         _refit_all(fits, base, [*chain(*(chosen for chosen, _ in more))], prefer)
         lists += more
-    fits = _with_fitted_shapes(fits, base, prefer, search)
     best_log_p = torch.stack([log_p for _, log_p in lists]).amin(0)
     order = [terms[number] for number in in_order((-best_log_p).tolist(), terms)]
     leading = _at_best_shapes(_leading(list(fits.values()), base, prefer, search), base, order, prefer, search.shapes)
@@ -137,20 +135,6 @@ def _part_fits(base: FittedModel, parts: int) -> list[Callable[[], _Part | None]
     return [partial(fit_to, part == number) for number in range(parts)]
 
 
-def _first_start(base: FittedModel, away: float) -> list[Start]:
-    """Return the initial values as a start if a parameter moved far from them, as a missing effect can cause."""
-    prepared = base.model.prepared
-    if not prepared.beginnings:
-        return []
-    theta, own = prepared.start(), base.model.base - prepared.beginnings
-    sizes = torch.stack([theta[:own], base.parameters[:own]]).abs()
-    if not bool((sizes.amax(0) > away * sizes.amin(0)).any()):
-        return []
-    parameters = torch.cat([theta, base.parameters[base.model.base :]])
-    residual = base.model.residual(parameters)
-    return [(parameters, clipped_residual(residual))] if bool(residual.isfinite().all()) else []
-
-
 def _refit_all(
     fits: dict[Key, FittedModel],
     base: FittedModel,
@@ -167,26 +151,6 @@ def _refit_all(
         if term.key not in fits or prefer.score(fit, base) > prefer.score(fits[term.key], base):
             fits[term.key] = fit
     return done[len(works) :]
-
-
-def _with_fitted_shapes(
-    fits: dict[Key, FittedModel], base: FittedModel, prefer: ModelPrior, settings: SearchSettings
-) -> dict[Key, FittedModel]:
-    """Return the fits with the shape numbers of those within reach fitted, for effects that act through a trajectory.
-
-    At the shapes of the grid a wide dead zone can be far less likely than a constant force, and the comparison would
-    depend on the grid.
-    """
-    known = base.model.prepared
-    near = within_reach([prefer.score(fit, base) for fit in fits.values()], settings)
-    places = [key for key in compress(fits, near) if known.ports[fits[key].model.terms[-1].port].clock is not None]
-    shaped = run_parallel(
-        [partial(shape_fitted, fits[key]) for key in places],
-        known,
-        [fits[key].model.terms[-1] for key in places],
-        "shape of a candidate",
-    )
-    return fits | dict(zip(places, shaped, strict=True))
 
 
 def _leading(
@@ -251,8 +215,8 @@ def by_joint_fits(
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
     """Return the fit, or a simpler fit that is no worse; and the ranking, with rivals that lose their gain moved back.
 
-    At a port that is not pointwise the search is linear along a trajectory that the effect has shaped: a rival can
-    follow that trajectory, but not produce it. The same holds for an effect that scales a signal: next to it a fitted
+    At a port that is not pointwise the search is linear around a fit that the effect has shaped: a rival can follow
+    that fit, but not reach it. The same holds for an effect that scales a signal: next to it a fitted
     parameter and a constant gain differ by its factor, and without it they are equal. So rivals as near as the effect
     are fitted, unless a ``known`` fit keeps the gain.
     """

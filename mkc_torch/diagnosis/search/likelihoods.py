@@ -149,9 +149,12 @@ class LogLikelihoods:
         )
 
     def near_the_best(self, within: float) -> LogLikelihoods:
-        """Keep the models within some nats of the most likely for a series, without or with a candidate."""
+        """Keep the first model, and those near the most likely of a series, without or with a candidate.
+
+        The first is the white noise of the sensors, under which the residual is that of the open loop.
+        """
         gap = np.minimum(_gap(self.without).min(1), _gap(self.with_candidate).min((1, 2), initial=np.inf))
-        kept = np.flatnonzero(gap <= within)
+        kept = np.flatnonzero((gap <= within) | (np.arange(len(gap)) == 0))
         return LogLikelihoods(
             tuple(self.models[number] for number in kept),
             self.without[kept],

@@ -67,7 +67,7 @@ class SearchProblem:
         return replace(self, values=rest * self.values, counts=rest)
 
     def is_nonlinear(self, term: Term) -> bool:
-        """Whether an effect acts through a trajectory, so that its tangents hold for small sizes only."""
+        """Whether an effect changes other samples' residuals too, so that its tangents hold for small sizes only."""
         return self.tangents.pointwise[term.port] is None
 
     def tangents_of(self, terms: Sequence[Term]) -> Sequence[Float[Tensor, "N m q"]]:

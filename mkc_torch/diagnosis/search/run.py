@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted_with_effect
-from mkc_torch.diagnosis.model.shapes import shape_fitted, with_profiled_shape
+from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.drift import NoiseFit
 from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum
@@ -52,8 +52,6 @@ class SearchResult:
         compared: fits of the leading candidates, each under its own remaining noise; empty if all share one noise.
         longer: ratio by which a recording has to be longer to show the effect, if it is real; infinite if unknown.
         with_noise: whether noise and physics were selected together.
-        without_candidate: the simulation without the candidate, if the noise found with the candidate makes both
-            equally likely, and more likely than the simulation's previous noise; otherwise None.
         follow: open-loop fits with effects, most likely first, with which the simulation follows the recording far
             better, if no candidate passed the surrogates.
     """
@@ -70,7 +68,6 @@ class SearchResult:
     compared: Sequence[FittedModel] = ()
     longer: float = math.inf
     with_noise: bool = False
-    without_candidate: FittedModel | None = None
     follow: tuple[FittedModel, ...] = ()
 
     @property
@@ -151,7 +148,6 @@ def run_search(
         best = _settled(refined(best, base, again=True), base)
         best = with_spectrum(best, seen)
         best = shape_fitted(best)
-        best = best if quick else with_profiled_shape(best)
     return SearchResult(
         best.model.terms[-1],
         best,
@@ -199,11 +195,8 @@ def _shows(base: FittedModel, fit: FittedModel, settings: Settings) -> bool:
     """Whether a fit without an effect shows the effect fully: it rejects no more samples, and its scale is no larger.
 
     Then the effect is tested by tangents there. At a fit with the effect, a barely visible effect may have any size,
-    such as a step while the sensor does not move, and the linearisation at that size does not hold at size 0. For an
-    effect that acts through a trajectory, tangents at the fit with it are used.
+    such as a step while the sensor does not move, and the linearisation at that size does not hold at size 0.
     """
-    if fit.model.prepared.ports[fit.model.terms[-1].port].clock is not None:
-        return False
     least, search = settings.noise.rejected_below, settings.search
     rejected = (base.weights < least) & (fit.weights >= least)
     return float(rejected.double().mean()) < search.hidden and bool((fit.d > search.smaller * base.d).all())
@@ -287,7 +280,7 @@ def screening_p_value(
         quick: draw none; test whether a candidate gains more than its penalty.
 
     Returns:
-        0 if an effect acts through a trajectory: there refits can find what the linearisation does not.
+        0 if an effect changes other samples' residuals too: there refits can find what the linearisation does not.
     """
     scene, own = located.scene, located.fit.model.terms[-1]
     if any(scene.is_nonlinear(term) for term in (*scene.terms, own)):

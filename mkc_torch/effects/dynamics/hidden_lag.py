@@ -36,8 +36,9 @@ class HiddenLag(RateEffect):
         ``τ ż = x − z``. What the state loses, the store gains.
     Drivers: the state only, with its history since the start of the run.
     Units: γ, the store's capacity as a share of the state's, is a number; the time constant τ in s.
-    Plausible: γ from 0 to 30. A store with a very short lag only adds to the capacity; where that is a parameter of the
-        simulation, γ is not identifiable without this bound.
+    Plausible: γ from 0 to 100: the structure of a house holds up to some 50 times the heat of its air. A store with a
+        very short lag only adds to the capacity; where that is a parameter of the simulation, γ is not identifiable
+        without this bound.
     Source: two-node thermal networks; Bacher & Madsen, Energy and Buildings 43 (2011); Maxwell's model of a damper.
     """
 
@@ -46,7 +47,7 @@ class HiddenLag(RateEffect):
     is_generalisation = True
     continuous: Mapping[str, tuple[float, float]] = {"time_constant": (0.001, 0.4)}
     fitted_shape: Mapping[str, tuple[float, float]] = {"time_constant": (0.001, 0.4)}
-    upper = 30.0
+    upper = 100.0
     gain = "share"
     plot_axis = ""
     equation = "δẋ = γ (z − x) / τ,  τ ż = x − z"

@@ -98,15 +98,6 @@ def sized_noise(
     return replace(noise, selected=with_most_likely_sizes(flow, names, channels, noise.selected, largest, rounding))
 
 
-def noise_of(prepared: Observable, declared: Mapping[str, float]) -> StateSpaceNoise | None:
-    """The noise of a simulation's observer; None for an open-loop simulation."""
-    observer = prepared.observer
-    if observer is None:
-        return None
-    given = tuple(name in declared for name in prepared.channels)
-    return StateSpaceNoise(SelectedNoise(observer.disturbances, (), (), observer.sensor, 0.0, given), observer)
-
-
 @dataclass(frozen=True)
 class DisturbancePath:
     """A disturbance estimated from all samples, (N,), and its standard error, (N,)."""

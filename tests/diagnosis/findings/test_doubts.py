@@ -67,8 +67,8 @@ def test_an_amplitude_at_its_bound_or_ten_times_the_plausible_size_is_impossible
         term = Term(effect, None, effect.shapes(tank.time)[0], place)
         return far_from_plausible(term, torch.tensor([gamma]).double(), term.context(tank, None))
 
-    assert text(HiddenLag(), 30.0, "lagged rate of level").startswith("Its share ended at 30, the upper bound")
-    assert text(HiddenLag(), 29.0, "lagged rate of level") == ""
+    assert text(HiddenLag(), 100.0, "lagged rate of level").startswith("Its share ended at 100, the upper bound")
+    assert text(HiddenLag(), 90.0, "lagged rate of level") == ""
     assert text(EFFECTS["dead_zone"], 1.0, "input pump") == ""  # all of a dead zone
 
     class Known(HiddenLag):

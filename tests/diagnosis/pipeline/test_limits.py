@@ -190,6 +190,4 @@ def test_progress_counts_the_items_of_a_stage():
     progress = Progress()
     diagnose(*pendulum(), **QUICK, progress=progress)
     assert progress.stages[:2] == ["reading the recording", "fitting the simulation alone"]
-    assert {"fit of a leading candidate", "part held out", "test of evidence"} <= set(progress.things) or {
-        "fit of a candidate", "part held out", "test of evidence",
-    } <= set(progress.things)  # fmt: skip
+    assert {"model", "part held out", "test of evidence"} <= set(progress.things)

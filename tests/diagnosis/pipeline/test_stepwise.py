@@ -24,8 +24,8 @@ RESIDUAL = torch.randn(N, 1, generator=torch.Generator().manual_seed(1), dtype=t
 NOTHING = SimpleNamespace(log_likelihood=torch.zeros(N, dtype=torch.float64), residual=RESIDUAL)
 
 
-def located(beyond, with_noise=False):
-    return SimpleNamespace(beyond=beyond, with_noise=with_noise, fit=SimpleNamespace(model=SimpleNamespace(sizes=(3,))))
+def located(beyond):
+    return SimpleNamespace(beyond=beyond, fit=SimpleNamespace(model=SimpleNamespace(sizes=(3,))))
 
 
 @pytest.mark.parametrize(
@@ -46,12 +46,6 @@ def test_a_candidate_counts_by_its_held_out_gain_or_if_far_beyond_all_surrogates
         holds(located(beyond), NOTHING, evidence(mean, spread), BLOCKS, 0, ConfirmationSettings(), first=first)
         is counts
     )
-
-
-@pytest.mark.parametrize(("mean", "counts"), [(0.01, True), (-0.01, True), (-0.5, False)])
-def test_blocks_only_reject_if_noise_and_physics_were_selected_together(mean, counts):
-    candidate = located(0.0, with_noise=True)
-    assert holds(candidate, NOTHING, evidence(mean, 1.0), BLOCKS, 0, ConfirmationSettings(), first=True) is counts
 
 
 def drifting_evidence(step):

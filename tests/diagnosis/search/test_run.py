@@ -10,7 +10,6 @@ from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import candidate_terms
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.search.joint_refits import _first_start
 from mkc_torch.diagnosis.search.linearise import linearise
 from mkc_torch.diagnosis.search.run import _settled, _with_tangents, run_search
 from mkc_torch.diagnosis.search.tangents import Candidates, tangents_of
@@ -127,27 +126,3 @@ def test_a_fit_that_did_not_converge_is_restarted():
     again = _settled(stopped, base)
     assert again.log_likelihood == pytest.approx(settled.log_likelihood, abs=1e-3)
     torch.testing.assert_close(again.parameters, settled.parameters, rtol=0.0, atol=1e-4)
-
-
-class Driven(Line):
-    """A line whose last parameter is an initial state."""
-
-    beginnings = 1
-
-
-@pytest.mark.parametrize(
-    ("line", "now", "starts"),
-    [
-        (Driven(), [4.1, 0.4], 1),  # more than five times its initial value
-        (Driven(), [0.1, 0.4], 1),  # less than a fifth of it
-        (Driven(), [-0.9, 0.4], 0),
-        (Driven(), [0.9, 9.0], 0),  # initial states do not count
-        (Line(), [4.1, 0.4], 0),  # the simulation has no initial values of a user
-    ],
-)
-def test_initial_values_are_a_start_if_a_parameter_is_far_from_them(line, now, starts):
-    fit = fitted(JointModel(line), line.start())
-    found = _first_start(dataclasses.replace(fit, parameters=torch.tensor(now, dtype=torch.float64)), 5.0)
-    assert len(found) == starts
-    for parameters, _ in found:
-        torch.testing.assert_close(parameters, line.start())

@@ -52,7 +52,7 @@ def test_losses_dissipate_energy(name):
 
 def test_signs_of_amplitudes():
     assert {e.id for e in DYNAMICS if e.lower == -math.inf} >= set(EITHER_SIGN)
-    assert {e.id: e.upper for e in DYNAMICS if 1.0 < e.upper < math.inf} == {"hidden_lag": 30.0, "hidden_mode": 10.0}
+    assert {e.id: e.upper for e in DYNAMICS if 1.0 < e.upper < math.inf} == {"hidden_lag": 100.0, "hidden_mode": 10.0}
     assert {e.id for e in DYNAMICS if (e.lower, e.upper) == (0.0, 1.0)} >= set(SHARES)
     for effect in DYNAMICS:
         assert effect.one_sided or effect.id in EITHER_SIGN or effect.id not in IDS

@@ -56,7 +56,7 @@ def diagnosis():
     recording = pendulum_recording(lambda _, speed: 0.12 * speed**2)
     # a catalogue of forces along the motion only
     effects = (LinearDrag(), QuadraticDrag(), UnknownRate("own"), UnknownRate("position"))
-    return diagnose(Pendulum(), recording, effects=effects, surrogates=19, max_findings=1)
+    return diagnose(Pendulum(), recording, effects=effects, surrogates=39, max_findings=1)
 
 
 @pytest.mark.e2e

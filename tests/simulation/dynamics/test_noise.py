@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from mkc_torch.simulation.dynamics.noise import disturbance_paths, most_likely_noise, noise_of, sized_noise
+from mkc_torch.simulation.dynamics.noise import disturbance_paths, most_likely_noise, sized_noise
 from mkc_torch.simulation.dynamics.noise_selection import SelectedNoise
 from mkc_torch.simulation.dynamics.observer import Disturbance
 from tests.simulation.dynamics.oscillating import course, disturbed_states, flow, oscillator, recorded, theta_of
@@ -105,9 +105,6 @@ class TestMostLikelyNoise:
         found = select_noise(prepared, theta, declared={"position": 0.0101})
         assert found.selected.sensor.tolist() == [0.0101]
         assert found.selected.declared == (True,)
-        again = noise_of(prepared.observed(found.observer), {"position": 0.0101})
-        assert again.selected.declared == (True,)
-        assert again.selected.sensor.tolist() == [0.0101]
 
     def test_the_selection_is_repeatable_along_the_observed_run(self):
         prepared, theta, _ = disturbed_oscillator(WHITE)
@@ -130,15 +127,3 @@ class TestMostLikelyNoise:
         prepared, theta, _ = disturbed_oscillator(count=40)
         theta[:2] = torch.nan
         assert select_noise(prepared, theta) is None
-
-    def test_an_open_loop_simulation_has_no_noise_model(self):
-        prepared, *_ = disturbed_oscillator(count=40)
-        assert noise_of(prepared, {}) is None
-
-    def test_the_noise_of_an_observed_simulation_is_that_of_its_observer(self):
-        prepared, theta, _ = disturbed_oscillator(WHITE)
-        observer = select_noise(prepared, theta).observer
-        found = noise_of(prepared.observed(observer), {})
-        assert found.observer is observer
-        assert found.selected.disturbances == observer.disturbances
-        assert found.selected.declared == (False,)

@@ -1,12 +1,9 @@
-"""Earlier findings are compared again with their rivals, with the later findings in the model."""
-
-from types import SimpleNamespace
+"""A lag of a sensor is distinguished from a lag of the input once the other physics is in the model."""
 
 import pytest
 import torch
 
 from mkc_torch import Recording, diagnose
-from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch, revised
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics, Parameter
 
@@ -48,24 +45,9 @@ def recording(samples=800, step=3.0, fine=20):
 
 
 @pytest.mark.e2e
-def test_a_lag_of_the_sensor_takes_the_place_of_a_lag_of_the_input_once_radiation_is_found():
+def test_radiation_and_a_lag_of_the_sensor_are_found():
     effects = [effect for effect in DYNAMICS if effect.id in NAMES]
     found = diagnose(Heater(), recording(), effects=effects, surrogates=19)
     sizes = {finding.effect: {p.name: p.value for p in finding.parameters} for finding in found.findings}
     assert set(sizes) == {"thermal_loss", "sensor_lag"}
     assert sizes["sensor_lag"]["lag"] == pytest.approx(12.0, rel=0.02)
-
-
-def search_of(*findings):
-    return StepwiseSearch(None, findings, None, None, (), ())
-
-
-@pytest.mark.parametrize("quick", [True, False])
-def test_findings_of_a_quick_look_or_of_white_noise_stay(quick):
-    search = search_of(SimpleNamespace(with_noise=quick), SimpleNamespace(with_noise=quick))
-    assert revised(search, SimpleNamespace(quick=quick)) is search
-
-
-def test_a_single_finding_stays():
-    search = search_of(SimpleNamespace(with_noise=True))
-    assert revised(search, SimpleNamespace(quick=False)) is search
