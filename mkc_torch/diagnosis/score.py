@@ -204,7 +204,7 @@ def score(fit: FittedModel, basis: ScoreBasis, settings: Settings, near: Sequenc
         near: further noise models to try.
     """
     flow = _flow(fit)
-    if flow is None or _is_implausible(fit, basis):
+    if flow is None or is_implausible(fit, basis):
         return None
     flow = replace(flow, counts=basis.counts)
     models = [*_grid(fit, flow, basis).singles(), *near, *_own_noise(fit, basis)]
@@ -273,8 +273,13 @@ def _flow(fit: FittedModel) -> Flow | None:
     return flow if flow is not None and all(bool(np.isfinite(array).all()) for array in arrays) else None
 
 
-def _is_implausible(fit: FittedModel, basis: ScoreBasis) -> bool:
-    """Whether an effect changes a rate by far more than the rates of the recording: two that cancel each other."""
+def is_implausible(fit: FittedModel, basis: ScoreBasis) -> bool:
+    """Whether an effect changes a rate by far more than the rates of the recording, so that two changes cancel.
+
+    Args:
+        fit: the model.
+        basis: with the largest rates of the recording.
+    """
     if not fit.model.terms:
         return False
     model, prepared = fit.model, fit.model.prepared.dynamics

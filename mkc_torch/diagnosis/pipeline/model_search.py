@@ -220,7 +220,7 @@ def _named(models: Sequence[Candidate], alone: Candidate) -> list[Candidate]:
     def replaced(model: Candidate) -> bool:
         return any(
             len(other.fit.model.terms) <= len(model.fit.model.terms)
-            and other.log_size <= model.log_size + math.log(_NAMED)
+            and other.log_typical_size <= model.log_typical_size + math.log(_NAMED)
             for other in named
         )
 

@@ -20,7 +20,7 @@ from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise, has_
 from mkc_torch.diagnosis.model.shapes import shape_fitted, with_profiled_shape
 from mkc_torch.diagnosis.model.suspect import suspect_id
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
-from mkc_torch.diagnosis.score import Score, ScoreBasis, score
+from mkc_torch.diagnosis.score import Score, ScoreBasis, is_implausible, score
 from mkc_torch.diagnosis.search.move_fits import (
     POLISHED,
     at_initial_values,
@@ -110,6 +110,14 @@ class Candidate:
         if free is None:
             return math.inf
         return float(free.residual.square().mean(0).clamp(min=1e-300).sqrt().log().mean())
+
+    @cached_property
+    def log_typical_size(self) -> float:
+        """As :attr:`log_size`, of the median of the absolute residual: outliers do not count."""
+        free = self.fit.open_loop
+        if free is None:
+            return math.inf
+        return float(free.residual.abs().median(0).values.clamp(min=1e-300).log().mean())
 
 
 def model_key(terms: Iterable[Term]) -> ModelKey:
@@ -220,8 +228,13 @@ class BeamSearch:
         for group in groups:
             wide = with_wide_grid(group, fit.model.prepared) or tuple(group)
             [addition] = additions(fit, wide, self.settings.noise)[:1]
-            fit = fitted_with(fit, addition)
+            fit = self._fitted_with(fit, addition)
         return fit
+
+    def _fitted_with(
+        self, fit: FittedModel, addition: Addition, others: Sequence[Callable[[], FittedModel | None]] = ()
+    ) -> FittedModel:
+        return fitted_with(fit, addition, others, implausible=partial(is_implausible, basis=self.basis))
 
     def _expand(self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term]) -> None:
         """Fit and score the models that one move leads to."""
@@ -231,7 +244,7 @@ class BeamSearch:
             others = self._other_starts(fit, terms, further) if not have else {}
             for addition in self._chosen(additions(fit, terms, self.settings.noise), model, rank, further):
                 key = model_key([*fit.model.terms, addition.starts[0][0]])
-                work = partial(fitted_with, fit, addition, others.get(addition.key, ()))
+                work = partial(self._fitted_with, fit, addition, others.get(addition.key, ()))
                 works.append((key, f"add {self._id(addition.starts[0][0])}", work))
         for number, term in enumerate(fit.model.terms):
             if have > 1:

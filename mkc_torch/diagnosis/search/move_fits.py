@@ -58,14 +58,28 @@ def fitted_through_noise(noisy: FittedModel, term: Term, size: torch.Tensor) -> 
 
 
 def fitted_with(
-    fit: FittedModel, addition: Addition, others: Sequence[Callable[[], FittedModel | None]] = ()
+    fit: FittedModel,
+    addition: Addition,
+    others: Sequence[Callable[[], FittedModel | None]] = (),
+    *,
+    implausible: Callable[[FittedModel], bool] = lambda _: False,
 ) -> FittedModel:
-    """Return the fit with one more effect, from its best shapes and from other fits."""
+    """Return the most likely plausible fit with one more effect, from its best shapes and from other fits.
+
+    Args:
+        fit: the fit without the effect.
+        addition: the effect with its shapes.
+        others: further fits with the effect.
+        implausible: whether a fit is not to be returned if there is another, such as a curve of the angle that cancels
+            the simulation's own gravity.
+    """
     begun = sorted((_begun(fit, term, size) for term, size in addition.starts), key=lambda found: -found.log_likelihood)
     least = 0.5 * (begun[0].log_likelihood + fit.log_likelihood)
     near = [found for number, found in enumerate(begun[:POLISHED]) if number == 0 or found.log_likelihood >= least]
     near += [found for other in others if (found := other()) is not None]
-    return with_form_of_grid(most_likely([_polished(found) for found in near]), SEARCH)
+    polished = [_polished(found) for found in near]
+    plausible = [found for found in polished if not implausible(found)]
+    return with_form_of_grid(most_likely(plausible or polished), SEARCH)
 
 
 def _polished(begun: FittedModel) -> FittedModel:

@@ -7,6 +7,7 @@ import torch
 from mkc_torch import diagnose
 from mkc_torch.diagnosis.io.model import DiagnosedModel
 from mkc_torch.effects.context import Context
+from mkc_torch.effects.dynamics.constant_force import ConstantForce
 from mkc_torch.effects.dynamics.linear_drag import LinearDrag
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 from mkc_torch.effects.dynamics.unknown_rate import DEGREE, UnknownRate
@@ -54,16 +55,16 @@ def test_code_equals_the_curve(context, of):
 def diagnosis():
     """Return the diagnosis of a pendulum with a hidden force of constant sign, by the square of its speed."""
     recording = pendulum_recording(lambda _, speed: 0.12 * speed**2)
-    # a catalogue of forces along the motion only
-    effects = (LinearDrag(), QuadraticDrag(), UnknownRate("own"), UnknownRate("position"))
-    return diagnose(Pendulum(), recording, effects=effects, surrogates=39, max_findings=1)
+    # the curve's mean over the speeds is 0, so the force is a constant and a curve
+    effects = (LinearDrag(), QuadraticDrag(), ConstantForce(), UnknownRate("own"), UnknownRate("position"))
+    return diagnose(Pendulum(), recording, effects=effects, surrogates=39, max_findings=2)
 
 
 @pytest.mark.e2e
 def test_a_force_outside_the_catalogue_is_found_as_unknown(diagnosis):
     assert diagnosis.verdict == "unexplained"
-    (finding,) = diagnosis.findings
-    assert finding.effect == "unknown"
+    constant, finding = diagnosis.findings
+    assert (constant.effect, finding.effect) == ("constant_force", "unknown")
     assert finding.channels == ("rate of speed",)
     assert finding.held_out.confidence_interval[0] > 0.0
     assert finding.held_out.rmse_before > 1.5 * NOISE
@@ -75,5 +76,5 @@ def test_a_force_outside_the_catalogue_is_found_as_unknown(diagnosis):
 @pytest.mark.e2e
 def test_model_is_restored_with_the_same_curve(diagnosis):
     again = DiagnosedModel.from_json(diagnosis.model.to_json(), simulation=Pendulum())
-    assert again.terms[0].effect.plot_axis == diagnosis.model.terms[0].effect.plot_axis
-    assert again.terms[0].shape == diagnosis.model.terms[0].shape
+    assert again.terms[1].effect.plot_axis == diagnosis.model.terms[1].effect.plot_axis == "own"
+    assert again.terms[1].shape == diagnosis.model.terms[1].shape
