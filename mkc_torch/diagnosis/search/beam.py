@@ -51,14 +51,23 @@ LEAST_WIDTH = 3
 MOST_TERMS = 5
 """Largest number of effects of a model."""
 
-MOST_MODELS = 60
-"""Largest number of models of a recording."""
+MOST_MODELS = 45
+"""Largest number of models that the beam tries; the best of them is then improved further."""
+
+_IMPROVED = 15
+"""Largest number of models that are tried to improve the best."""
 
 _ADDITIONS = (12, 5, 3, 2, 2, 2)
 """Number of effects that are tried in addition to the best model of the beam, the second, and so on."""
 
 _TWINS = (2, 1, 0)
 """Number of these that repeat an effect of the model at another place, whatever their linear gain."""
+
+_EXCHANGES = 2
+"""Number of effects of the same channels that are tried in place of each effect of the best model."""
+
+_LEADERS = (3, 1, 0)
+"""Number of these that lead the screening of the simulation alone, whatever their linear gain."""
 
 LARGER = 1.05
 """Ratio of open-loop residuals with and without an effect above which it enlarges the residual: the ratio at which
@@ -154,7 +163,7 @@ class BeamSearch:
 
         Args:
             start: the simulation alone, in open loop if that is found.
-            further: candidates that are tried first, such as the leaders of another screening.
+            further: candidates that lead the screening, strongest first; they are tried first.
         """
         self._keep([Candidate(start, score(start, self.basis, self.settings), "")])
         terms = with_wide_grid(self.terms, start.model.prepared)
@@ -165,7 +174,8 @@ class BeamSearch:
                 break
             for rank, model in waiting:
                 expanded.add(model.key)
-                self._expand(model, rank, terms, further)
+                self._expand(model, rank, terms, further, self.most_models)
+        self._improve(terms, further, expanded)
         self._under_noise()
         return self.best
 
@@ -236,8 +246,10 @@ class BeamSearch:
     ) -> FittedModel:
         return fitted_with(fit, addition, others, implausible=partial(is_implausible, basis=self.basis))
 
-    def _expand(self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term]) -> None:
-        """Fit and score the models that one move leads to."""
+    def _expand(
+        self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term], most: int
+    ) -> None:
+        """Fit and score the models that one move leads to, up to a number of models in all."""
         fit, have = model.fit, len(model.fit.model.terms)
         works: list[tuple[ModelKey, str, Callable[[], FittedModel | None]]] = []
         if have < self.most_terms and not any(term.effect.is_curve for term in fit.model.terms):
@@ -256,7 +268,33 @@ class BeamSearch:
                 works.append((model_key(rest), move, partial(fitted_exchanged, fit, number, self._all(other))))
         orders = in_other_orders(fit)
         works += [(model_key(o), "another order in series", partial(fitted_reordered, fit, o)) for o in orders]
-        self._fit(works, fit, self.most_models)
+        self._fit(works, fit, most)
+
+    def _improve(self, terms: Sequence[Term], further: Sequence[Term], expanded: set[ModelKey]) -> None:
+        """Expand the best model, and exchange its effects for others of the same channels, as long as that helps."""
+        most, best = len(self.models) + _IMPROVED, None
+        while best is not self.best and self.best.fit.model.terms and len(self.models) < most:
+            best = self.best
+            if best.key not in expanded:
+                expanded.add(best.key)
+                self._expand(best, 0, terms, further, most)
+            self._exchange(best, terms, most)
+
+    def _exchange(self, model: Candidate, terms: Sequence[Term], most: int) -> None:
+        """Fit the model with another effect of the same channels in place of each of its effects."""
+        fit, ports, works = model.fit, model.fit.model.prepared.ports, []
+        for number, term in enumerate(fit.model.terms):
+            rest = self.models.get(model_key([other for other in fit.model.terms if other is not term]))
+            if rest is None:
+                continue
+            near = [other for other in terms if ports[other.port].channels == ports[term.port].channels]
+            found = sorted(additions(rest.fit, near, self.settings.noise), key=self._worth, reverse=True)
+            for addition in [other for other in found if other.key != term.key][:_EXCHANGES]:
+                other = addition.starts[0][0]
+                key = model_key([*rest.fit.model.terms, other])
+                move = f"exchange {self._id(term)} for {self._id(other)}"
+                works.append((key, move, partial(self._fitted_with, rest.fit, addition)))
+        self._fit(works, fit, most)
 
     def _other_starts(
         self, fit: FittedModel, terms: Sequence[Term], further: Sequence[Term]
@@ -297,22 +335,23 @@ class BeamSearch:
         self, found: Sequence[Addition], model: Candidate, rank: int, further: Sequence[Term]
     ) -> list[Addition]:
         """Return the additions to fit: the largest linear gains, less the price of the effect's numbers."""
-
-        def value(addition: Addition) -> float:
-            return addition.gain - self._price(addition.starts[0][0], addition.starts[0][1])
-
         most = _ADDITIONS[min(rank, len(_ADDITIONS) - 1)]
-        ranked = sorted(found, key=value, reverse=True)
+        ranked = sorted(found, key=self._worth, reverse=True)
         if model.fit.model.terms:
             own = {term.effect.id for term in model.fit.model.terms}
             # an effect at two places, as two vessels that overflow, may show only with both
             twins = [a for a in ranked if a.starts[0][0].effect.id in own][: _TWINS[min(rank, len(_TWINS) - 1)]]
-            ranked = [a for a in ranked if a.gain >= _PAYS * self._price(a.starts[0][0], a.starts[0][1])]
-            return list({a.key: a for a in [*ranked[:most], *twins]}.values())
+            # far from the solution an open loop shows a lag or a delay less than the screening under process noise did
+            led = [a for term in further for a in ranked if a.key == term.key][: _LEADERS[min(rank, len(_LEADERS) - 1)]]
+            ranked = [a for a in ranked if a.gain >= _PAYS * self._price(*a.starts[0])]
+            return list({a.key: a for a in [*ranked[:most], *twins, *led]}.values())
         first = [addition for term in further for addition in found if addition.key == term.key]
         first = list({addition.key: addition for addition in first}.values())
         others = [addition for addition in ranked if addition.key not in {a.key for a in first}]
         return [*first, *others[: max(most - len(first), most // 2)]]
+
+    def _worth(self, addition: Addition) -> float:
+        return addition.gain - self._price(*addition.starts[0])
 
     def _price(self, term: Term, size: torch.Tensor) -> float:
         """Return the price of an effect next to a linear gain, a likelihood of one horizon."""
