@@ -183,9 +183,9 @@ def _in_turn(beam: BeamSearch) -> list[list[Candidate]]:
     """Return chains of models to test: that of the simplest good model, and models with one effect.
 
     The simplest good model has the lowest price of those that this recording cannot separate from the highest score
-    and that follow it as well in open loop, and each of its effects raises the score: effects that only gain together have no null in which the first is
-    missing alone. The screening has shown that an effect is missing, so the simulation alone is no rival of models with
-    one effect: those that are more likely are tested if the first chain is refused.
+    and that follow it as well in open loop. Each of its effects raises the score: effects that only gain together have
+    no null in which the first is missing alone. The screening has shown that an effect is missing, so the simulation
+    alone is no rival of models with one effect: those that are more likely are tested if the first chain is refused.
     """
     alone = beam.models[()]
     least = -math.inf if alone.score is None else alone.score.log_likelihood

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from functools import partial
 
@@ -42,7 +43,7 @@ def stepwise_search(problem: Problem, known: PartialResult, baseline: ProcessNoi
         whole = partial(search_models, baseline, terms, options, generator, known.keep_search)
         search = known.continued("searching models", whole)
         repeated = known.improved(
-            "halving the step of integration", partial(_at_smaller_step, problem, known, search), search
+            "halving the step of integration", partial(at_smaller_step, problem, known, search), search
         )
         known.keep_search(repeated)
         return repeated
@@ -60,16 +61,25 @@ def stepwise_search(problem: Problem, known: PartialResult, baseline: ProcessNoi
     return search
 
 
-def _at_smaller_step(problem: Problem, known: PartialResult, search: StepwiseSearch) -> StepwiseSearch:
-    """Halve the step of integration and fit the findings again, as long as they depend on the step."""
+def at_smaller_step(problem: Problem, known: PartialResult, search: StepwiseSearch) -> StepwiseSearch:
+    """Halve the step of integration and fit the findings again, as long as they depend on the step.
+
+    Args:
+        problem: the input of the diagnosis.
+        known: receives the fit of the simulation and the findings together, so that both have the same step.
+        search: the search so far; returned if a fit at a smaller step loses the recording.
+    """
     while search.found:
         finer = with_smaller_step(search.found[-1].fit, known.options.settings.noise)
         if finer is None:
             break
+        again = copy.copy(known)
         try:
-            search = with_step_of(search, fit_baseline(problem, known, finer), known.options)
+            search = with_step_of(search, fit_baseline(problem, again, finer), known.options)
         except NoFitError:
-            break  # the findings at the coarser step remain
+            break
+        again.keep_search(search)
+        vars(known).update(vars(again))
     return search
 
 

@@ -246,9 +246,7 @@ class BeamSearch:
     ) -> FittedModel:
         return fitted_with(fit, addition, others, implausible=partial(is_implausible, basis=self.basis))
 
-    def _expand(
-        self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term], most: int
-    ) -> None:
+    def _expand(self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term], most: int) -> None:
         """Fit and score the models that one move leads to, up to a number of models in all."""
         fit, have = model.fit, len(model.fit.model.terms)
         works: list[tuple[ModelKey, str, Callable[[], FittedModel | None]]] = []
@@ -283,7 +281,7 @@ class BeamSearch:
     def _exchange(self, model: Candidate, terms: Sequence[Term], most: int) -> None:
         """Fit the model with another effect of the same channels in place of each of its effects."""
         fit, ports, works = model.fit, model.fit.model.prepared.ports, []
-        for number, term in enumerate(fit.model.terms):
+        for term in fit.model.terms:
             rest = self.models.get(model_key([other for other in fit.model.terms if other is not term]))
             if rest is None:
                 continue

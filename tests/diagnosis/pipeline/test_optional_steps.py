@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+import mkc_torch.diagnosis.pipeline.search as search_stage
 from mkc_torch import diagnose
 from mkc_torch._parallel.deadline import Stopped
 from mkc_torch._parallel.pool import allow_copies, shared
@@ -140,6 +141,23 @@ def test_a_failed_improvement_changes_nothing():
         assert known.improved("halving", repeated, before) is before
     assert (known.search, known.baseline, known.fitted) == (before, "coarse", False)
     assert len(warnings) == 1
+
+
+def test_a_lost_fit_at_a_smaller_step_leaves_the_simulation_at_the_step_of_the_findings(monkeypatch):
+    known, before = partial_result(), search_of(("one",))
+    known.options = SimpleNamespace(settings=Settings())
+    known.keep_search(before)
+    known.keep_baseline("coarse", with_noise=True)
+    found = SimpleNamespace(found=[SimpleNamespace(fit=None)])
+
+    def fit_baseline(_, scratch, prepared):
+        scratch.keep_baseline(prepared, with_noise=True)
+
+    monkeypatch.setattr(search_stage, "with_smaller_step", lambda *_: "fine")
+    monkeypatch.setattr(search_stage, "fit_baseline", fit_baseline)
+    monkeypatch.setattr(search_stage, "with_step_of", lambda *_: failing(NoFitError("lost"))())
+    assert search_stage.at_smaller_step(None, known, found) is found
+    assert (known.search, known.baseline) == (before, "coarse")
 
 
 def context():
