@@ -16,13 +16,11 @@ from mkc_torch.diagnosis.pipeline.prepare import Problem, SearchOptions, prepare
 from mkc_torch.diagnosis.pipeline.search import fit_baseline, stepwise_search
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.diagnosis.thresholds import LEVEL
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.protocol import Simulation
-
-LEVEL = 0.05
-"""Default rate of false alarms."""
 
 SURROGATES = 99
 """Default number of surrogates for each p-value."""

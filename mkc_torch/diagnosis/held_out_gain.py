@@ -6,11 +6,9 @@ import math
 from typing import Literal
 
 from mkc_torch.diagnosis.parts import HeldOut
+from mkc_torch.diagnosis.thresholds import SMALL
 
 Confirmation = Literal["surely", "probably", "not shown", "worse"]
-
-SMALL = 0.05
-"""Relative reduction of the residual below which a finding is small."""
 
 _NORMAL_95 = 1.96
 """Half-width of a 95 % interval in standard errors."""

@@ -23,6 +23,7 @@ from mkc_torch._support.quantum import rounding_of
 from mkc_torch.diagnosis.goodness_of_fit import size_of
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE_RATE
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.draws import drawn
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
@@ -46,9 +47,6 @@ _SETTLED = 0.05
 
 _DRAWS = 8
 """Recordings drawn for the variance ratio."""
-
-FAR = 10.0
-"""Multiple of the recording's largest rate above which an effect is implausible."""
 
 _USUAL = 0.9
 """Quantile of an effect's changes over time that is compared."""
@@ -291,7 +289,8 @@ def is_implausible(fit: FittedModel, basis: ScoreBasis) -> bool:
         if port.kind in RATES and port.channels[0] in largest:
             signal = signals[term.port]
             change = term.effect.change(gamma, term.shape, term.context(prepared, signal))[:, 0].detach()
-            if not float(change.abs().nan_to_num(torch.inf).quantile(_USUAL)) <= FAR * largest[port.channels[0]]:
+            usual = float(change.abs().nan_to_num(torch.inf).quantile(_USUAL))
+            if not usual <= IMPLAUSIBLE_RATE * largest[port.channels[0]]:
                 return True
     return False
 

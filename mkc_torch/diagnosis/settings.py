@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 from mkc_torch._support.arguments import checked_number, checked_whole, refuse_other_type
+from mkc_torch.diagnosis import thresholds
 
 
 class _Stage:
@@ -98,7 +99,7 @@ class NoiseSettings(_Stage):
     plausible: float = 6.0
     reported_drift: float = 3.0
     reported_autocorrelation: float = 0.05
-    disturbance_gain: float = 6.0
+    disturbance_gain: float = thresholds.DISTURBANCE
     max_disturbances: int = 2
     last_step: float = 5.0
 
@@ -186,12 +187,12 @@ class NamingSettings(_Stage):
         shape_alike: nats within which neighbouring shapes are equivalent; the middle of them is taken.
     """
 
-    separable: float = 4.5
+    separable: float = thresholds.SEPARABLE
     kept: float = 0.8
-    nameless: float = 10.0
+    nameless: float = thresholds.NAMELESS
     over_driver: float = 0.25
     over_motion: float = 0.5
-    is_generalisation: float = 5.0
+    is_generalisation: float = thresholds.GENERALISATION
     roleless: float = 0.3
     follower: float = 0.95
     alike_columns: float = 0.9
@@ -288,12 +289,12 @@ class EvidenceSettings(_Stage):
     density_off: float = 1.95
     student_closer: float = 0.5
     white_level: float = 0.01
-    followed: float = 0.5
-    useful: float = 0.35
-    correction: float = 1.0
-    above_floor: float = 1.5
-    shape_level: float = 0.001
-    shape_nats: float = 6.0
+    followed: float = thresholds.FOLLOWED
+    useful: float = thresholds.USEFUL
+    correction: float = thresholds.CORRECTION
+    above_floor: float = thresholds.ABOVE_FLOOR
+    shape_level: float = thresholds.SHAPE_LEVEL
+    shape_nats: float = thresholds.SHAPE_NATS
     disturbed: float = 0.5
 
 

@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.environment import GoodnessOfFit, Grade, Verdict
 from mkc_torch.diagnosis.goodness_of_fit import pooled, poor_fits
 from mkc_torch.diagnosis.result import Diagnosis, Stop
 from mkc_torch.diagnosis.settings import EvidenceSettings
+from mkc_torch.diagnosis.thresholds import LOST, MUCH_REJECTED
 from mkc_torch.diagnosis.vetoes import grade, is_dropped
 from mkc_torch.simulation.dynamics.noise import StateSpaceNoise
 
@@ -32,14 +33,8 @@ DiagnosisDoubt = Literal["unfit", "unexplained", "unconfirmed", "not_better", "m
 ``much_rejected``: a third or more of the samples of an output were rejected.
 """
 
-MUCH_REJECTED = 1.0 / 3.0
-"""Share of rejected samples from which a diagnosis is doubtful."""
-
 _REJECTED = 0.5
 """Weight below which a sample counts as rejected, as in the reports."""
-
-_LOST = -1.0
-"""Smallest explained share of an output in the mean over the outputs."""
 
 UNFIT = "explained_share"
 """Rule that a simulation has to pass for any verdict but unfit."""
@@ -78,7 +73,7 @@ class FitAssessment:
 
         An output that runs away counts against the others: an effect can tie one output to an input, and lose another.
         """
-        shares = [pooled(fits, _LOST) for fits in (self.follows, self.corrected) if fits]
+        shares = [pooled(fits, LOST) for fits in (self.follows, self.corrected) if fits]
         return max(shares, default=None)
 
     def unfit(self, settings: EvidenceSettings) -> bool:

@@ -15,17 +15,9 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.decisions import Decision
 from mkc_torch.diagnosis.environment import Grade
-from mkc_torch.diagnosis.held_out_gain import SMALL, better_on_average, change, confirmation, mean_ratio
+from mkc_torch.diagnosis.held_out_gain import better_on_average, change, confirmation, mean_ratio
 from mkc_torch.diagnosis.parts import Finding, HeldOut
-
-FAR = 10.0
-"""Multiple of the plausible size above which a finding is unconfirmed."""
-
-VISIBLE = 0.1
-"""Share of the change of a sensor's vector that its compared length has to show."""
-
-LEVEL = 0.05
-"""Rate of false alarms of a context without one."""
+from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE_SIZE, LEVEL, SMALL, VISIBLE
 
 
 @dataclass(frozen=True)
@@ -134,7 +126,9 @@ def size_plausible(finding: Finding, context: VetoContext) -> Decision | None:
     if times is None and not finding.cannot_be:
         return None
     text = finding.plausibility or f"Its size is {times:.2g} of the largest plausible size."
-    return _decision("size_plausible", finding, context, times, FAR, passed=not finding.cannot_be, sentence=text)
+    return _decision(
+        "size_plausible", finding, context, times, IMPLAUSIBLE_SIZE, passed=not finding.cannot_be, sentence=text
+    )
 
 
 def shape(finding: Finding, context: VetoContext) -> Decision | None:

@@ -29,32 +29,19 @@ from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.pipeline.suspected import suspected_models
 from mkc_torch.diagnosis.pipeline.trail import trail_of
 from mkc_torch.diagnosis.score import basis_of, score, separation
-from mkc_torch.diagnosis.search.beam import LARGER, BeamSearch, Candidate, in_order
+from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate, in_order
 from mkc_torch.diagnosis.search.columns import best_change
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.search.screening import screened
+from mkc_torch.diagnosis.thresholds import FAR_LESS, KEPT, LARGER, NAMED
 from mkc_torch.nonlinear import NoFitError
 
 Keep = Callable[[StepwiseSearch], object]
 """A callback that receives the search so far, in case it is stopped."""
 
-FAR_LESS = 0.3
-"""Ratio of open-loop residuals with and without an effect below which the effect is mentioned though no finding.
-
-Set on 38 recordings of a ship, a circuit, a basin and a sled (`python -m tests.thresholds.open_loop`, seeds 0 to 3):
-where nothing is hidden and a disturbance acts, no candidate is below it in 10 of 10 (smallest 0.33); the hidden
-effect is in 18 of 28.
-"""
-
 _NEXT = 3
 """Models that are asked in turn if held-out blocks refuse the only effect of the best."""
-
-_NAMED = 1.15
-"""Ratio of open-loop residuals up to which named effects are preferred to a curve without a name."""
-
-_KEPT = 0.5
-"""Share of the gain over the simulation alone that a fit under process noise may lose to the open-loop fit."""
 
 _QUICK_MODELS = 8
 """Largest number of models in a quick look."""
@@ -225,7 +212,7 @@ def _named(models: Sequence[Candidate], alone: Candidate) -> list[Candidate]:
     def replaced(model: Candidate) -> bool:
         return any(
             len(other.fit.model.terms) <= len(model.fit.model.terms)
-            and other.log_typical_size <= model.log_typical_size + math.log(_NAMED)
+            and other.log_typical_size <= model.log_typical_size + math.log(NAMED)
             for other in named
         )
 
@@ -339,7 +326,7 @@ def _final(step: Candidate, beam: BeamSearch, options: SearchOptions, *, last: b
         return step
     # tests of evidence need residuals that are white under the noise; a lag of a sensor is exact in open loop only
     gained = step.value - beam.models[()].value
-    less = max(options.settings.naming.separable * beam.basis.kappa, _KEPT * gained)
+    less = max(options.settings.naming.separable * beam.basis.kappa, KEPT * gained)
     whole = beam.simplified(beam.to_the_end(step))
     whole = beam.with_best_hold(whole, options.fixed) if last else whole
     noisy = beam.under_noise(whole, less)

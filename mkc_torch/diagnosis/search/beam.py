@@ -40,22 +40,8 @@ from mkc_torch.diagnosis.search.moves import (
     with_wide_grid,
 )
 from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.diagnosis.thresholds import IMPROVED, LARGER, LEAST_WIDTH, MOST_MODELS, MOST_TERMS, PAYS, WIDTH
 from mkc_torch.nonlinear import NoFitError
-
-WIDTH = 6
-"""Models of the beam."""
-
-LEAST_WIDTH = 3
-"""Models that are expanded whatever their distance to the best."""
-
-MOST_TERMS = 5
-"""Largest number of effects of a model."""
-
-MOST_MODELS = 45
-"""Largest number of models that the beam tries; the best of them is then improved further."""
-
-_IMPROVED = 15
-"""Largest number of models that are tried to improve the best."""
 
 _ADDITIONS = (12, 5, 3, 2, 2, 2)
 """Number of effects that are tried in addition to the best model of the beam, the second, and so on."""
@@ -68,13 +54,6 @@ _EXCHANGES = 2
 
 _LEADERS = (3, 1, 0)
 """Number of these that lead the screening of the simulation alone, whatever their linear gain."""
-
-LARGER = 1.05
-"""Ratio of open-loop residuals with and without an effect above which it enlarges the residual: the ratio at which
-held-out blocks reject a finding."""
-
-_PAYS = 0.5
-"""Share of its price that an addition to a model with effects has to gain in the linearised model."""
 
 _NOISY = 3
 """Number of leading models that are also fitted under their process noise."""
@@ -270,7 +249,7 @@ class BeamSearch:
 
     def _improve(self, terms: Sequence[Term], further: Sequence[Term], expanded: set[ModelKey]) -> None:
         """Expand the best model, and exchange its effects for others of the same channels, as long as that helps."""
-        most, best = len(self.models) + _IMPROVED, None
+        most, best = len(self.models) + IMPROVED, None
         while best is not self.best and self.best.fit.model.terms and len(self.models) < most:
             best = self.best
             if best.key not in expanded:
@@ -341,7 +320,7 @@ class BeamSearch:
             twins = [a for a in ranked if a.starts[0][0].effect.id in own][: _TWINS[min(rank, len(_TWINS) - 1)]]
             # far from the solution an open loop shows a lag or a delay less than the screening under process noise did
             led = [a for term in further for a in ranked if a.key == term.key][: _LEADERS[min(rank, len(_LEADERS) - 1)]]
-            ranked = [a for a in ranked if a.gain >= _PAYS * self._price(*a.starts[0])]
+            ranked = [a for a in ranked if a.gain >= PAYS * self._price(*a.starts[0])]
             return list({a.key: a for a in [*ranked[:most], *twins, *led]}.values())
         first = [addition for term in further for addition in found if addition.key == term.key]
         first = list({addition.key: addition for addition in first}.values())

@@ -22,6 +22,7 @@ from mkc_torch.diagnosis.search.likelihoods import PRICE, Columns, Limits, LogLi
 from mkc_torch.diagnosis.search.significance import COUNTS, COUNTS_NOT, best_rank_p_value
 from mkc_torch.diagnosis.search.significance import price as price_of_candidate
 from mkc_torch.diagnosis.search.tangents import ModelTangents
+from mkc_torch.diagnosis.thresholds import NULL_WITHIN
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid, key_of
@@ -45,9 +46,6 @@ _LEADING = 6
 
 _SETTLED = 0.1
 """Nats that some likelihood has to gain in a round for another round."""
-
-_NULL_WITHIN = 6.0
-"""Nats behind the most likely noise within which surrogates of another kind of noise are drawn too."""
 
 _KINDS = 3
 """Largest number of kinds of noise for surrogates."""
@@ -347,7 +345,7 @@ def _kinds(found: LogLikelihoods) -> list[int]:
     values = found.without[:, 0]
     kinds: dict[object, int] = {}
     for number in np.argsort(-values):
-        if values[number] < values.max() - _NULL_WITHIN or len(kinds) == _KINDS:
+        if values[number] < values.max() - NULL_WITHIN or len(kinds) == _KINDS:
             break
         kind = tuple(sorted((place, lasting > 0.0) for place, _, lasting in found.models[number].components))
         kinds.setdefault(kind, int(number))

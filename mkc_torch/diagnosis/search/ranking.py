@@ -15,6 +15,7 @@ from mkc_torch.diagnosis.model.term import ANY, Driver, Key, Term, continuous
 from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
 from mkc_torch.diagnosis.search.problem import CandidateSearch
 from mkc_torch.diagnosis.settings import NamingSettings, SearchSettings, Settings
+from mkc_torch.diagnosis.thresholds import VISIBLE
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
@@ -26,9 +27,6 @@ AKAIKE = 1.0
 
 _TIE = 1e-6
 """Nats within which scores are equal: rounding changes them by 1e-12, a sample by 1e-3 and more."""
-
-VISIBLE = 0.1
-"""Share of an offset that a length has to show: a small offset in random directions shows 1 / √3. By reasoning."""
 
 
 class ModelPrior:

@@ -7,7 +7,6 @@ import math
 from mkc_torch._support.typesetting import plain
 from mkc_torch.diagnosis.environment import NoiseEnvironment
 from mkc_torch.diagnosis.held_out_gain import (
-    SMALL,
     Confirmation,
     better_on_average,
     change,
@@ -16,6 +15,7 @@ from mkc_torch.diagnosis.held_out_gain import (
     rejects,
 )
 from mkc_torch.diagnosis.result import Diagnosis, HeldOut, ResidualSizes
+from mkc_torch.diagnosis.thresholds import SMALL
 from mkc_torch.report.diagnosis.numbers import improvement
 from mkc_torch.report.words.numbers import size
 

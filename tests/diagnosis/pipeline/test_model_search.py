@@ -9,11 +9,12 @@ import torch
 
 from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, fit_alone
 from mkc_torch.diagnosis.pipeline import model_search
-from mkc_torch.diagnosis.pipeline.model_search import FAR_LESS, search_models
+from mkc_torch.diagnosis.pipeline.model_search import search_models
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.search.screening import screened
 from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.diagnosis.thresholds import FAR_LESS
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.nonlinear import NoFitError
 from tests.diagnosis.cart import DRAG, FRICTION, Cart, cart_recording, cart_terms

@@ -10,7 +10,8 @@ from mkc_torch import Recording
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.search.ranking import VISIBLE, is_hardly_visible
+from mkc_torch.diagnosis.search.ranking import is_hardly_visible
+from mkc_torch.diagnosis.thresholds import VISIBLE
 from mkc_torch.effects import SENSOR
 from mkc_torch.simulation import Magnetometer
 
