@@ -1,9 +1,10 @@
 """The numbers that decide a verdict on a model of differential equations, each with its unit and its source.
 
-A number decides if half or twice of it changes a verdict: ``python -m tests.thresholds.deciding --gate DIR`` counts that
-on stored recordings. Shares and ratios have no unit; gains and differences of log-likelihood are in nats. "By judgement"
-means on the project's own generated recordings, which no published figure is measured on. Numerical tolerances are next
-to their code. Those that are fields of :class:`~mkc_torch.diagnosis.settings.Settings` are its defaults.
+A number decides if half or twice of it changes a verdict: ``python -m tests.thresholds.deciding --gate DIR`` counts
+that on the trails of recordings. Shares and ratios have no unit; gains and differences of log-likelihood are in nats.
+"By judgement" means on the project's own generated recordings, which no published figure is measured on. Numerical
+tolerances are next to their code. Fields of :class:`~mkc_torch.diagnosis.settings.Settings` have these numbers as
+defaults.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ SEPARABLE = 4.5
 of standard errors is twice the nats."""
 
 DISTURBANCE = 6.0
-"""Nats that a disturbance of a state, or a slow error of an output, has to gain to enter the noise: with two numbers and
-about ten places for it, Schwarz's and the choice's price at 300 samples is 5.7 + ln 10 / 2, and more at more samples."""
+"""Nats that a disturbance of a state, or a slow error of an output, has to gain to enter the noise. By
+judgement; the rate of false alarms is measured with it (`python -m tests.gate.null_p_values`)."""
 
 NAMELESS = 10.0
 """Price of a curve without a name in nats: it can follow any named effect slightly better. By judgement."""
@@ -33,7 +34,7 @@ IMPLAUSIBLE_RATE = 10.0
 """Multiple of a rate's largest value in the recording that no effect changes it by. By judgement."""
 
 WIDTH = 6
-"""Models of the beam; `docs/decisions/score.md`."""
+"""Models of the beam. By judgement: more cost time."""
 
 LEAST_WIDTH = 3
 """Models of the beam that are expanded whatever their distance to the best: one losing step is allowed."""
@@ -78,7 +79,8 @@ IMPLAUSIBLE_SIZE = 10.0
 """Multiple of the plausible size above which a finding is unconfirmed. By judgement."""
 
 VISIBLE = 0.1
-"""Share of the change of a sensor's vector that its compared length has to show. By judgement."""
+"""Share of the change of a sensor's vector that its compared length has to show: a small offset in random directions
+shows 1 / √3. By reasoning."""
 
 SHAPE_LEVEL = 0.001
 """p-value of a free curve's gain below which a name is only the nearest in the catalogue. By judgement."""

@@ -38,8 +38,7 @@ def test_drag_of_a_light_ball_is_confirmed_by_its_second_drop(load_example, tmp_
     item, other = drops("Whiffle_Ball_1")
     (proof,) = load_example("held_out").prove(load_example("falling_balls").Ball(), item, [other], max_findings=1)
     (finding,) = proof.diagnosis.findings
-    alike = [item.effect for item in finding.alternatives if not item.separable]  # by one short drop
-    assert "linear_drag" in (finding.effect, *alike)
+    assert finding.effect in ("linear_drag", "power_law")  # a drag that grows linearly, or nearly so
     before, after = proof.mean_absolute(proof.time - proof.time[0] > 1.0)
     assert before > 5.0
     assert after < 0.25 * before
