@@ -14,7 +14,7 @@ LEVEL = 0.05
 Workers", 1925)."""
 
 NULL_WITHIN = 6.0
-"""Nats within which noise models are told as equally likely, and each is drawn from: :data:`DISTURBANCE`."""
+"""Nats within which noise models are alike, and each is drawn from: :data:`DISTURBANCE`."""
 
 SEPARABLE = 4.5
 """Nats by which a rival has to be less likely to be distinguishable: three standard errors, because the squared number
