@@ -147,3 +147,10 @@ def test_the_architecture_page_names_existing_files_and_every_package():
     }
     assert {name for name in named if not any(path.endswith(f"/{name}") for path in there)} == set()
     assert {f"{floor}/" for floors in LAYERS for floor in floors if (ROOT / floor).is_dir()} <= named
+
+
+def test_no_test_of_the_diagnosis_patches_a_private_name():
+    private = re.compile(r"""setattr\([^,()]*(?:,\s*["']|["'][\w.]*\.)_""")
+    tests = sorted((ROOT.parent / "tests" / "diagnosis").rglob("*.py"))
+    found = [path.name for path in tests if private.search(path.read_text(encoding="utf-8"))]
+    assert not found

@@ -92,7 +92,7 @@ def sizes_of(
 
 def without_finding(case: EvidenceContext) -> Evidence | None:
     """Score the final model without the finding, if later findings may have masked its gain and if it can be fitted."""
-    if not case.overlaid or _confirmed(case):
+    if not case.overlaid or confirmed_alone(case):
         return None
     try:
         return held_out(case.without_and_with[0], case.blocks)
@@ -100,7 +100,7 @@ def without_finding(case: EvidenceContext) -> Evidence | None:
         return None
 
 
-def _confirmed(case: EvidenceContext) -> bool:
+def confirmed_alone(case: EvidenceContext) -> bool:
     """Whether held-out blocks confirm the finding without the later findings."""
     before, after = case.pairs[case.number] if case.pairs else case.held_out[case.number : case.number + 2]
     difference = after.log_likelihood - before.log_likelihood

@@ -39,7 +39,7 @@ _FIXES = 0.5
 _MATTERS = 0.97
 """Residual, relative to that without an input, below which the input matters."""
 
-_LAGS = (2, 5, 20)
+LAGS = (2, 5, 20)
 """Tried delays of an input, in samples."""
 
 
@@ -169,7 +169,7 @@ def _trials(prepared: PreparedDynamics) -> list[_Trial]:
         turned[:, number] = -turned[:, number]
         trials.append(_Trial(_always(f"With the sign of `{name}` reversed,"), _with_inputs(prepared, turned)))
         step = float(prepared.time.diff().median())
-        for lag in (lag for lag in _LAGS if lag < len(prepared.time) // 10):
+        for lag in (lag for lag in LAGS if lag < len(prepared.time) // 10):
             late = prepared.inputs_at_rows.clone()
             late[lag:, number] = prepared.inputs_at_rows[:-lag, number]
             text = f"With `{name}` delayed by {lag * step:.3g} s,"

@@ -19,10 +19,10 @@ from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum, dct
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_PLAIN = 0.3
+PLAIN = 0.3
 """Relative distance to the level of its high-frequency end within which a spectrum counts as white."""
 
-_END = 20
+END = 20
 """The highest 1/20 of the frequencies set the level of the spectrum's end."""
 
 _MOST = 1000
@@ -76,13 +76,13 @@ class MissingSamples:
         """Return the imputation of the rejected samples under this noise spectrum."""
         spectrum = noise_spectrum.root.square()
         K, m = spectrum.shape
-        end = spectrum[-max(K // _END, 1) :].mean(0)
+        end = spectrum[-max(K // END, 1) :].mean(0)
         excess = end / spectrum - 1.0
         parts: list[_ImputedPart | None] = []
         log_det = 0.0
         for channel in range(m):
             far = excess[:, channel].abs()
-            rows = torch.nonzero(far > _PLAIN).flatten()
+            rows = torch.nonzero(far > PLAIN).flatten()
             lost = len(self._lost[channel])
             if len(rows) == 0 or lost == 0:
                 parts.append(None)

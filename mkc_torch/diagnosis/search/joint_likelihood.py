@@ -375,7 +375,7 @@ def _surrogate_test(
     for count in (min(_FIRST_DRAWS, draws), draws - min(_FIRST_DRAWS, draws)):
         if not count:
             break
-        some = scene.with_draws(near, _drawn(scene, found.models[kind], left, count, generator))
+        some = scene.with_draws(near, noise_surrogates(scene, found.models[kind], left, count, generator))
         near = some.near_the_best(_HOPELESS)
         drawn = some.with_candidate[:, :, 1:].max(0) - some.without[:, 1:].max(0)
         gained = np.concatenate([gained, drawn], 1)
@@ -398,7 +398,7 @@ def _beyond_usual(
     return float((own - usual[:, 0]).max()), (drawn - usual).max(0), usual[:, 0]
 
 
-def _drawn(
+def noise_surrogates(
     scene: _LinearisedRecording,
     model: NoiseModel,
     left: Float[np.ndarray, "N m"],

@@ -234,7 +234,7 @@ def by_joint_fits(
     won = prefer.score(best, base)
     fitted = {fit.model.terms[-1].key: fit for fit in reversed(known) if prefer.score(fit, base) >= naming.kept * won}
     new = [rival for rival in near if terms[rival.number].key not in fitted]
-    works = [partial(_tried, best, terms[rival.number], look, rival.number) for rival in new]
+    works = [partial(refitted_rival, best, terms[rival.number], look, rival.number) for rival in new]
     for fit in run_parallel(works, base.model.prepared, [terms[rival.number] for rival in new]):
         fitted[fit.model.terms[-1].key] = fit
     fits = [fitted[terms[rival.number].key] for rival in near]
@@ -295,7 +295,7 @@ def _in_series(term: Term, model: JointModel) -> bool:
     return model.prepared.ports[term.port].in_series(term.port)
 
 
-def _tried(best: FittedModel, term: Term, look: CandidateSearch, number: int) -> FittedModel:
+def refitted_rival(best: FittedModel, term: Term, look: CandidateSearch, number: int) -> FittedModel:
     return refined(refitted(best, term, look, number), look.scene.base)
 
 

@@ -39,10 +39,10 @@ _SINGULAR = 1e-9
 PRICE = NoiseSettings().disturbance_gain
 """Nats that a disturbance has to gain to enter the noise model, by default."""
 
-_CELLS = 1 << 17
+CELLS = 1 << 17
 """Numbers of whitened tangents per block: 1 MB, which fits into a processor's cache."""
 
-_COVARIANCES = 8_000_000
+COVARIANCES = 8_000_000
 """Numbers of the filters' covariances that are held at once: 64 MB, a few times over."""
 
 _PARTS = 8
@@ -243,7 +243,7 @@ def _in_this_process(
         before = None if known is None else known[number]
         seen = left[:count]
         products = None if before is None else _products_with(flow, gains, place, candidates, seen, before)
-        products = products or _products(flow, gains, place, candidates, basis[:count], seen, groups)
+        products = products or products_of(flow, gains, place, candidates, basis[:count], seen, groups)
         if products is None:
             continue
         kept[number] = [(gram, norm) for gram, _, norm in products]
@@ -271,7 +271,7 @@ def _under_each(
 ) -> Iterator[tuple[int, FilterGains, int, Float[np.ndarray, "N m K"]]]:
     """Yield for each model: its number, gains of a block of models, its number there, the whitened series."""
     states = flow.transition.shape[1] + max(len(model.components) for model in models)
-    block = max(1, _COVARIANCES // (len(flow.new) * states**2))
+    block = max(1, COVARIANCES // (len(flow.new) * states**2))
     for first in range(0, len(models), block):
         gains = gains_of(flow, filter_models(flow, models[first : first + block]))
         for number, values in whitened(flow, gains, series):
@@ -326,7 +326,7 @@ def _split(columns: Columns, groups: Sequence[tuple[np.ndarray, np.ndarray]]) ->
     return own, SeriesAlong(np.ascontiguousarray(new[..., order]), np.ascontiguousarray(shift[..., order]))
 
 
-def _products(
+def products_of(
     flow: Flow,
     gains: FilterGains,
     number: int,
@@ -349,7 +349,7 @@ def _products(
     crossed = np.zeros((len(known), K))
     pairs = [np.zeros((*index.shape[1:], *index.shape[::-1])) for _, index in groups]
     places = np.cumsum([0, *(index.size for _, index in groups)])
-    for rows, values in whitened_in_blocks(flow, gains, number, candidates, max(_CELLS // max(m * K, 1), 16)):
+    for rows, values in whitened_in_blocks(flow, gains, number, candidates, max(CELLS // max(m * K, 1), 16)):
         counts = used[rows]
         block = values.reshape(-1, K) if counts.all() else values[counts]
         crossed += known[:, first[rows.start] : first[rows.stop]] @ block
@@ -382,7 +382,7 @@ def _products_with(
     left: Float[np.ndarray, "M Y"],
     known: Products,
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]] | None:
-    """Return the result of :func:`_products` with known products of the tangents; None where that is not possible.
+    """Return the result of :func:`products_of` with known products of the tangents; None where that is not possible.
 
     The transposed whitening of the few series replaces the whitening of the many tangents.
     """

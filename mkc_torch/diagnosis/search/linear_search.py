@@ -27,7 +27,7 @@ _LEFT = 1e-4
 _SINGULAR = 1e-10
 """Ratio of the smallest to the largest eigenvalue of normalised parameters below which they are inseparable."""
 
-_CELLS = 3_000_000
+CELLS = 3_000_000
 """Largest number of candidates' inner products with series, over several sizes, that are held at once."""
 
 _EQUAL = 3.0
@@ -393,7 +393,7 @@ class LinearSearch:
             found = self._log_likelihood(_remaining(power, score.square().sum(-2)))
             for (family, rotated, cross), (left, log_det) in zip(in_family, lefts, strict=True):
                 shadow = own.mT @ cross[index]  # (C, q, k)
-                several = max(1, _CELLS // max(score.numel(), 1))
+                several = max(1, CELLS // max(score.numel(), 1))
                 for share, rest, price in zip(
                     family.shares.split(several), left.split(several), log_det.split(several), strict=True
                 ):

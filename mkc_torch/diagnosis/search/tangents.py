@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 AT_ONCE = 8
 """Largest number of candidates whose tangents are computed together, so that a short recording's fit into the cache."""
 
-_CELLS = 4_000_000
+CELLS = 4_000_000
 """Numbers per block of tangents: 32 MB, of which a Fourier transform needs four times."""
 
 HELD = 8_000_000
@@ -30,7 +30,7 @@ HELD = 8_000_000
 
 
 def in_blocks(columns: Sequence[Tensor], at_once: int = AT_ONCE) -> Iterator[list[Tensor]]:
-    """Yield blocks of at most ``at_once`` matrices, or of about :data:`_CELLS` numbers.
+    """Yield blocks of at most ``at_once`` matrices, or of about :data:`CELLS` numbers.
 
     Example:
         >>> [len(block) for block in in_blocks([torch.ones(1000, 1)] * 10)]
@@ -41,7 +41,7 @@ def in_blocks(columns: Sequence[Tensor], at_once: int = AT_ONCE) -> Iterator[lis
     block: list[Tensor] = []
     for matrix in columns:
         block.append(matrix)
-        if len(block) == at_once or sum(known.numel() for known in block) >= _CELLS:
+        if len(block) == at_once or sum(known.numel() for known in block) >= CELLS:
             yield block
             block = []
     if block:

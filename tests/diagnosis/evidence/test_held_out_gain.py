@@ -76,7 +76,7 @@ def test_an_effect_confirmed_alone_is_not_evaluated_again(evidence_without_small
 
 @pytest.mark.e2e
 def test_a_diagnosis_notes_that_a_finding_was_evaluated_given_the_others(monkeypatch):
-    monkeypatch.setattr(prediction, "_confirmed", lambda *_: False)
+    monkeypatch.setattr(prediction, "confirmed_alone", lambda *_: False)
     current = np.sign(np.sin(2.0 * np.pi * TIME / 3.7))
     sensor = np.outer(current, [0.6, -0.5, 0.6]) + np.outer(TIME >= 14.0, [3.0, 2.0, -3.0])
     effects = [effect for effect in CATALOGUE if effect.id in ("current_field", "hard_iron_step")]

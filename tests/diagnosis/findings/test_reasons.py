@@ -20,7 +20,7 @@ N = 150
 @pytest.fixture(autouse=True)
 def _single_lag(monkeypatch):
     """Try a single lag, to save time."""
-    monkeypatch.setattr(reasons, "_LAGS", (5,))
+    monkeypatch.setattr(reasons, "LAGS", (5,))
 
 
 def pendulum_at(recording, stiffness=9.0, damping=0.15, system=Pendulum):
@@ -121,25 +121,18 @@ def test_a_simulation_without_differential_equations_gets_general_advice():
     assert "signs, units and the order of columns" in text
 
 
-@pytest.fixture
-def _no_trials(monkeypatch):
-    monkeypatch.setattr(reasons, "_of_trials", lambda *_: [])
-
-
-@pytest.mark.usefixtures("_no_trials")
 def test_a_parameter_at_its_bound_is_reported_with_its_value():
-    (text,) = reasons_for(pendulum_at(pendulum_recording(N=N)[0], damping=0.0))
-    assert text.startswith("`damping` is fitted to its bound, 0:")
+    found = reasons_for(pendulum_at(pendulum_recording(N=N)[0], damping=0.0))
+    assert any(text.startswith("`damping` is fitted to its bound, 0:") for text in found)
 
 
-@pytest.mark.usefixtures("_no_trials")
 @pytest.mark.parametrize(("damping", "words"), [(1e-4, "nearly 0"), (30.0, "at 1e+02 times its start value")])
 def test_a_parameter_that_vanishes_or_diverges_is_reported(damping, words):
-    (text,) = reasons_for(pendulum_at(pendulum_recording(N=N)[0], damping=damping))
-    assert text.startswith(f"The open-loop fit is best with `damping` {words}")
+    found = reasons_for(pendulum_at(pendulum_recording(N=N)[0], damping=damping))
+    assert any(text.startswith(f"The open-loop fit is best with `damping` {words}") for text in found)
 
 
-@pytest.mark.usefixtures("_no_trials")
 def test_without_a_remedy_the_advice_is_to_compare_columns():
-    (text,) = reasons_for(pendulum_at(pendulum_recording(N=N)[0]))
+    prepared = Pendulum().prepare(pendulum_recording(N=N)[0])
+    (text,) = reasons_for(fitted(JointModel(prepared), prepared.start()))
     assert text.startswith("No other start, sign or delay of an input improves the fit: compare columns")

@@ -52,8 +52,8 @@ def test_the_imputation_is_the_conditional_expectation(seed, share):
     spectra = falling_spectrum(N), 0.5 + 10.0 * torch.linspace(0.0, 1.0, N, dtype=torch.float64).square()
     values = counts * torch.randn(N, 2, generator=torch.Generator().manual_seed(seed)).double()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(imputation, "_PLAIN", 0.0)
-        patch.setattr(imputation, "_END", N)  # the level of the last frequency only
+        patch.setattr(imputation, "PLAIN", 0.0)
+        patch.setattr(imputation, "END", N)  # the level of the last frequency only
         filling = MissingSamples(counts, N).filling(noise_spectrum(*spectra))
     found = filling(dct(values))
     total = 0.0

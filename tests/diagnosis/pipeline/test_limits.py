@@ -125,8 +125,7 @@ def test_a_quick_look_finds_the_same_without_surrogates(monkeypatch, case, effec
         raise AssertionError("noise was drawn")
 
     monkeypatch.setattr("mkc_torch.diagnosis.search.run.surrogate_p_value", refuse)
-    monkeypatch.setattr("mkc_torch.diagnosis.search.run.surrogate_p_value", refuse)
-    monkeypatch.setattr("mkc_torch.diagnosis.search.joint_likelihood._drawn", refuse)
+    monkeypatch.setattr("mkc_torch.diagnosis.search.joint_likelihood.noise_surrogates", refuse)
     monkeypatch.setattr("mkc_torch.diagnosis.findings.finding.attributed", refuse)
     result = diagnose(*case(), quick=True)
     (finding,) = result.findings

@@ -102,7 +102,7 @@ def test_a_search_in_small_blocks_gives_the_same_gains(sensor, monkeypatch):
 
     whole = gains()
     monkeypatch.setattr(blocks, "HELD", 0)
-    monkeypatch.setattr(blocks, "_CELLS", 1)
+    monkeypatch.setattr(blocks, "CELLS", 1)
     monkeypatch.setattr(projection, "FILLED_AT_ONCE", 1)
     torch.testing.assert_close(gains(), whole, rtol=1e-9, atol=1e-9)
 
@@ -114,7 +114,7 @@ def test_no_tensor_holds_all_candidates_of_a_long_recording(monkeypatch):
     parameters = line.start()
     pseudo = torch.zeros(N, 1, dtype=torch.float64)
     monkeypatch.setattr(blocks, "HELD", 0)
-    monkeypatch.setattr(blocks, "_CELLS", 1_000_000)
+    monkeypatch.setattr(blocks, "CELLS", 1_000_000)
     with Largest() as largest:
         tangents = tangents_of(model, parameters, Settings().noise, terms)
         found = projection.CosineProjection.of(pseudo, torch.ones_like(pseudo), tangents, None)

@@ -68,8 +68,8 @@ def test_blocks_of_samples_and_of_models_change_nothing(monkeypatch):
     disturbed = NoiseModel((0.5,), ((0, 0.7, 1.0),), (False,))
     flow, y, _, _, columns = scene(sizes=(1, 3, 1, 2), one_sided=(False, False, True, False))
     whole = log_likelihoods(flow, [WHITE, disturbed], series(y), columns)
-    monkeypatch.setattr(likelihoods, "_CELLS", 1)  # the smallest block, 16 samples
-    monkeypatch.setattr(likelihoods, "_COVARIANCES", 1)  # one model per block
+    monkeypatch.setattr(likelihoods, "CELLS", 1)  # the smallest block, 16 samples
+    monkeypatch.setattr(likelihoods, "COVARIANCES", 1)  # one model per block
     blocks = log_likelihoods(flow, [WHITE, disturbed], series(y), columns)
     for name in ("without", "with_candidate", "sizes", "rank", "scale"):
         np.testing.assert_allclose(getattr(blocks, name), getattr(whole, name), rtol=1e-10, atol=1e-12)
@@ -85,7 +85,7 @@ def test_known_products_of_the_tangents_change_nothing(compiled, monkeypatch):
     first = log_likelihoods(flow, models, series(y[:, :1]), columns)
     whole = log_likelihoods(flow, models, series(y), columns)
     if compiled:  # then no tangent is whitened again
-        monkeypatch.setattr(likelihoods, "_products", None)
+        monkeypatch.setattr(likelihoods, "products_of", None)
     else:
         monkeypatch.setattr(whitening, "machine_code", lambda _: None)
     again = log_likelihoods(flow, models, series(y), columns, known=first.products)

@@ -126,7 +126,7 @@ def test_gains_with_drift_equal_the_dense_covariance(search, family, size):
 def test_drift_sizes_in_blocks_give_the_same_gains(search, monkeypatch):
     series = torch.stack([drifting(3.0, 0, seed=20), drifting(0.5, 1, seed=30)], -1)
     together = search.gains(series).ratio
-    monkeypatch.setattr("mkc_torch.diagnosis.search.linear_search._CELLS", 1)
+    monkeypatch.setattr("mkc_torch.diagnosis.search.linear_search.CELLS", 1)
     torch.testing.assert_close(search.gains(series).ratio, together, rtol=1e-9, atol=1e-9)
 
 

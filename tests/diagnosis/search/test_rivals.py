@@ -51,7 +51,7 @@ def rank(monkeypatch):
             fitted_keys.append(term.key)
             return fits[term.key]
 
-        monkeypatch.setattr(joint_refits, "_tried", tried)
+        monkeypatch.setattr(joint_refits, "refitted_rival", tried)
         monkeypatch.setattr(joint_refits, "run_parallel", lambda works, *_: [work() for work in works])
         best = fit_of(FRICTION, 100.0, size)
         scene = SimpleNamespace(
