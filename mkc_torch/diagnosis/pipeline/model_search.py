@@ -34,7 +34,7 @@ from mkc_torch.diagnosis.search.columns import best_change
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.search.screening import screened
-from mkc_torch.diagnosis.thresholds import FAR_LESS, KEPT, LARGER, NAMED
+from mkc_torch.diagnosis.thresholds import FAR_LESS, KEPT, NAMED
 from mkc_torch.nonlinear import NoFitError
 
 Keep = Callable[[StepwiseSearch], object]
@@ -169,10 +169,10 @@ def _goodness(fit: FittedModel) -> tuple[GoodnessOfFit, ...]:
 def _in_turn(beam: BeamSearch) -> list[list[Candidate]]:
     """Return chains of models to test: that of the simplest good model, and models with one effect.
 
-    The simplest good model has the lowest price of those that this recording cannot separate from the highest score
-    and that follow it as well in open loop. Each of its effects raises the score: effects that only gain together have
-    no null in which the first is missing alone. The screening has shown that an effect is missing, so the simulation
-    alone is no rival of models with one effect: those that are more likely are tested if the first chain is refused.
+    The simplest good model has the lowest price of those that this recording cannot separate from the highest score,
+    and each of its effects raises the score: effects that only gain together have no null in which the first is missing
+    alone. The screening has shown that an effect is missing, so the simulation alone is no rival of models with one
+    effect: those that are more likely are tested if the first chain is refused.
     """
     alone = beam.models[()]
     least = -math.inf if alone.score is None else alone.score.log_likelihood
@@ -188,13 +188,8 @@ def _in_turn(beam: BeamSearch) -> list[list[Candidate]]:
     single = [[model] for model in ranked if len(model.fit.model.terms) == 1]
     good = [model for model in ranked if model.value > alone.value]
     behind = beam.settings.naming.separable * beam.basis.kappa
-    alike = [
-        model
-        for model in good
-        if model.value >= good[0].value - behind and model.log_size <= good[0].log_size + math.log(LARGER)
-    ]
-    others = [model for model in good if all(model is not other for other in alike)]
-    for model in [*sorted(alike, key=lambda model: model.price), *others]:
+    alike = [model for model in good if model.value >= good[0].value - behind]
+    for model in [*sorted(alike, key=lambda model: model.price), *good[len(alike) :]]:
         chain = _chain(model, beam)
         if all(later.value > earlier.value for earlier, later in itertools.pairwise([alone, *chain])):
             return [chain, *[other for other in single if other[0].key != chain[0].key]][:_NEXT]
