@@ -159,8 +159,8 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
     count = 0 if unfit else len(case.found)
     graded = [_graded(case.found, number, final, whole, answers) for number in range(count)]
     without = replace(known, corrected=())
-    if without.unfit(settings.evidence) and not any(finding.grade in NAMED for finding, _ in graded):
-        # a correction that is not to be used makes no simulation usable
+    if without.unfit(settings.evidence) and not any(finding.grade in NAMED for finding, _ in graded[:1]):
+        # findings next to one that is not to be used make no simulation usable
         unfit, known, graded = True, without, []
     findings = tuple(finding for finding, decided in graded if not is_dropped(decided))
     without_size = tuple(finding for finding, decided in graded if is_dropped(decided))
