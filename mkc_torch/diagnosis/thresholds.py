@@ -42,11 +42,11 @@ LEAST_WIDTH = 3
 MOST_TERMS = 5
 """Largest number of effects of a model."""
 
-MOST_MODELS = 45
-"""Largest number of models that the beam tries; the best of them is then improved further."""
+MOST_MODELS = 60
+"""Largest number of models of a recording. By judgement: more cost time."""
 
-IMPROVED = 15
-"""Largest number of models that are tried to improve the best."""
+IMPROVING = 0.25
+"""Share of them that is kept for improving the best model of the beam. By judgement, on an arm with a propeller."""
 
 PAYS = 0.5
 """Share of its price that an addition to a model with effects has to gain in the linearised model. By judgement, on an

@@ -35,12 +35,13 @@ from mkc_torch.diagnosis.search.move_fits import (
 from mkc_torch.diagnosis.search.moves import (
     Addition,
     additions,
+    at_size_zero,
     in_other_orders,
     special_cases,
     with_wide_grid,
 )
 from mkc_torch.diagnosis.settings import Settings
-from mkc_torch.diagnosis.thresholds import IMPROVED, LARGER, LEAST_WIDTH, MOST_MODELS, MOST_TERMS, PAYS, WIDTH
+from mkc_torch.diagnosis.thresholds import IMPROVING, LARGER, LEAST_WIDTH, MOST_MODELS, MOST_TERMS, PAYS, WIDTH
 from mkc_torch.nonlinear import NoFitError
 
 _ADDITIONS = (12, 5, 3, 2, 2, 2)
@@ -147,13 +148,14 @@ class BeamSearch:
         self._keep([Candidate(start, score(start, self.basis, self.settings), "")])
         terms = with_wide_grid(self.terms, start.model.prepared)
         expanded: set[ModelKey] = set()
-        while len(self.models) < self.most_models:
+        most = self.most_models - int(IMPROVING * self.most_models)
+        while len(self.models) < most:
             waiting = [(rank, model) for rank, model in enumerate(self.beam()) if model.key not in expanded]
             if not waiting:
                 break
             for rank, model in waiting:
                 expanded.add(model.key)
-                self._expand(model, rank, terms, further, self.most_models)
+                self._expand(model, rank, terms, further, most)
         self._improve(terms, further, expanded)
         self._under_noise()
         return self.best
@@ -216,8 +218,8 @@ class BeamSearch:
         fit = start
         for group in groups:
             wide = with_wide_grid(group, fit.model.prepared) or tuple(group)
-            [addition] = additions(fit, wide, self.settings.noise)[:1]
-            fit = self._fitted_with(fit, addition)
+            found = additions(fit, wide, self.settings.noise)
+            fit = self._fitted_with(fit, found[0] if found else at_size_zero(fit, wide))
         return fit
 
     def _fitted_with(
@@ -249,15 +251,15 @@ class BeamSearch:
 
     def _improve(self, terms: Sequence[Term], further: Sequence[Term], expanded: set[ModelKey]) -> None:
         """Expand the best model, and exchange its effects for others of the same channels, as long as that helps."""
-        most, best = len(self.models) + IMPROVED, None
-        while best is not self.best and self.best.fit.model.terms and len(self.models) < most:
+        best = None
+        while best is not self.best and self.best.fit.model.terms and len(self.models) < self.most_models:
             best = self.best
             if best.key not in expanded:
                 expanded.add(best.key)
-                self._expand(best, 0, terms, further, most)
-            self._exchange(best, terms, most)
+                self._expand(best, 0, terms, further, self.most_models)
+            self._exchange(best, terms)
 
-    def _exchange(self, model: Candidate, terms: Sequence[Term], most: int) -> None:
+    def _exchange(self, model: Candidate, terms: Sequence[Term]) -> None:
         """Fit the model with another effect of the same channels in place of each of its effects."""
         fit, ports, works = model.fit, model.fit.model.prepared.ports, []
         for term in fit.model.terms:
@@ -271,7 +273,7 @@ class BeamSearch:
                 key = model_key([*rest.fit.model.terms, other])
                 move = f"exchange {self._id(term)} for {self._id(other)}"
                 works.append((key, move, partial(self._fitted_with, rest.fit, addition)))
-        self._fit(works, fit, most)
+        self._fit(works, fit, self.most_models)
 
     def _other_starts(
         self, fit: FittedModel, terms: Sequence[Term], further: Sequence[Term]

@@ -20,7 +20,7 @@ from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import shape_fitted, with_form_of_grid
 from mkc_torch.diagnosis.model.simpler import simpler_start
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.search.moves import STARTS, Addition
+from mkc_torch.diagnosis.search.moves import Addition, at_size_zero
 from mkc_torch.nonlinear import NoFitError
 
 POLISHED = 2
@@ -113,8 +113,7 @@ def fitted_exchanged(fit: FittedModel, number: int, group: Sequence[Term]) -> Fi
     rest = fitted_without(fit, number) if len(fit.model.terms) > 1 else _refitted(without_term(fit, number), fit)
     if rest is None:
         return None
-    zero = rest.parameters.new_zeros(rest.model.with_term(group[0]).size - rest.model.size)
-    return fitted_with(rest, Addition(tuple((term, zero) for term in group[:STARTS]), 0.0))
+    return fitted_with(rest, at_size_zero(rest, group))
 
 
 def _refitted(start: FittedModel, like: FittedModel) -> FittedModel | None:

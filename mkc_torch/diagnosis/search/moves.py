@@ -32,6 +32,9 @@ _OFFSET = 0.5
 _SHARES = (0.2, 0.4, 0.6, 0.8)
 """Levels tried in such a signal, as shares of its range."""
 
+_SPANNED = 1e-6
+"""Share of a candidate's change that is not a change by parameters, below which it acts as they do."""
+
 STARTS = 3
 """Shapes from which an effect is fitted: the best local maxima of its linear gain."""
 
@@ -60,7 +63,8 @@ def linear_gains(
         settings: which samples count.
 
     Returns:
-        Log-likelihood ratios in nats, 0 for a size whose sign the physics does not allow; and the sizes.
+        Log-likelihood ratios in nats, 0 for a size whose sign the physics does not allow, minus infinity for a
+        candidate that acts as the parameters do, such as a constant force next to a gravity; and the sizes.
     """
     tangents = tangents_of(fit.model, fit.parameters, settings, terms)
     values, counts = fit.pseudo(settings)
@@ -72,8 +76,13 @@ def linear_gains(
     gains, sizes = [], []
     for term, columns in zip(terms, tangents.candidates, strict=True):
         moved = (columns * weight.unsqueeze(-1)).flatten(0, 1)
+        before = moved.norm(dim=0)
         moved = moved - own @ (own.mT @ moved)
         scale = moved.norm(dim=0).clamp(min=1e-300)
+        if bool(((scale < _SPANNED * before) & (before > 0.0)).all()):
+            gains.append(-math.inf)
+            sizes.append(torch.zeros_like(scale))
+            continue
         size = -torch.linalg.lstsq(moved / scale, y.unsqueeze(-1), driver="gelsd").solution[:, 0] / scale
         within = size.clamp(term.effect.lower, term.effect.upper)
         left = float((y + moved @ within).square().sum())
@@ -88,7 +97,8 @@ def additions(fit: FittedModel, terms: Sequence[Term], settings: NoiseSettings) 
 
     Args:
         fit: the model.
-        terms: candidates with the shapes of their grids; effects that the model has are left out.
+        terms: candidates with the shapes of their grids; effects that the model has are left out, and those that act as
+            the model's parameters do, which would only undo the bounds of these.
         settings: which samples count.
     """
     known = {term.key for term in fit.model.terms}
@@ -101,10 +111,19 @@ def additions(fit: FittedModel, terms: Sequence[Term], settings: NoiseSettings) 
         groups.setdefault(term.key, []).append(number)
     found = []
     for numbers in groups.values():
+        numbers = [n for n in numbers if gains[n] > -math.inf]
+        if not numbers:
+            continue
         best = local_maxima([terms[n] for n in numbers], [gains[n] for n in numbers])
         starts = tuple((terms[numbers[k]], sizes[numbers[k]]) for k in best)
         found.append(Addition(starts, max(gains[n] for n in numbers)))
     return sorted(found, key=lambda addition: -addition.gain)
+
+
+def at_size_zero(fit: FittedModel, group: Sequence[Term]) -> Addition:
+    """Return an effect to add from size 0, at the first shapes of its grid."""
+    zero = fit.parameters.new_zeros(fit.model.with_term(group[0]).size - fit.model.size)
+    return Addition(tuple((term, zero) for term in group[:STARTS]), 0.0)
 
 
 def local_maxima(terms: Sequence[Term], gains: Sequence[float]) -> list[int]:

@@ -10,19 +10,24 @@ import torch
 from mkc_torch import Recording
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.shapes import candidates_of
 from mkc_torch.diagnosis.search.moves import (
     STARTS,
     additions,
+    at_size_zero,
     in_other_orders,
     linear_gains,
     local_maxima,
     special_cases,
     with_wide_grid,
 )
-from mkc_torch.diagnosis.settings import NoiseSettings
+from mkc_torch.diagnosis.settings import NoiseSettings, Settings
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.simulation import Dynamics, Parameter
 from tests.diagnosis.cart import DRAG, FRICTION, SAMPLES, STEP, Cart, cart_terms, first_term, fit_with, free_fit
 
 NOISE_SETTINGS = NoiseSettings()
+GENERATOR = torch.Generator().manual_seed(0)
 
 
 def test_the_hidden_drag_is_the_first_addition_with_its_size():
@@ -90,6 +95,33 @@ def test_drag_of_the_wrong_sign_gains_nothing():
     gains, sizes = linear_gains(fit, cart_terms(fit, "quadratic_drag"), NOISE_SETTINGS)
     assert gains == [0.0]
     assert [size.tolist() for size in sizes] == [[0.0]]
+
+
+class Fall(Dynamics):
+    states, outputs = ("height", "speed"), ("height",)
+    parameters = {"gravity": Parameter(9.8, lower=9.7, upper=9.9)}
+
+    def derivative(self, time, x, u, p):
+        return {"height": x.speed, "speed": -p.gravity}
+
+
+def test_an_effect_that_acts_as_a_parameter_does_is_not_added():
+    """A constant force would undo the bounds of gravity."""
+    time = torch.arange(200, dtype=torch.float64) * 0.01
+    height = -4.0 * time.square() + 0.1 * time.pow(3)
+    recording = Recording({"time": time, "height": height + 1e-3 * torch.randn(200, generator=GENERATOR).double()})
+    prepared = Fall().prepare(recording)
+    fit = fitted(JointModel(prepared), prepared.start())
+    effects = [effect for effect in CATALOGUE if effect.id in ("constant_force", "linear_drag")]
+    _, terms = candidates_of(Fall(), prepared, effects, Settings().drivers)
+    gains = linear_gains(fit, terms, NOISE_SETTINGS)[0]
+    by_id = {term.effect.id: gain for term, gain in zip(terms, gains, strict=True)}
+    assert by_id["constant_force"] == -math.inf
+    assert by_id["linear_drag"] > 0.0
+    assert [addition.key[0] for addition in additions(fit, terms, NOISE_SETTINGS)] == ["linear_drag"]
+    forces = [term for term in terms if term.effect.id == "constant_force"]
+    ((term, size),) = at_size_zero(fit, forces).starts
+    assert (term, size.tolist()) == (forces[0], [0.0])
 
 
 def shaped(**shape):
