@@ -226,6 +226,25 @@ def fit_with_process_noise(
     return ProcessNoiseFit(free, *best, starts)
 
 
+def at_half_step(base: ProcessNoiseFit) -> ProcessNoiseFit | None:
+    """Return the fit of the simulation alone with half the step of integration, from its parameters.
+
+    Returns:
+        None if the step is the smallest or the user's.
+
+    Raises:
+        NoFitError: the fit loses the recording.
+    """
+    fits = [fit for fit in (base.free, base.fit) if fit is not None]
+    again: dict[int, FittedModel] = {}
+    for fit in fits:
+        finer = fit.model.prepared.finer()
+        if finer is None:
+            return None
+        again[id(fit)] = fitted(JointModel(finer, fit.model.terms), fit.parameters, fit.bound, graduate=False)
+    return replace(base, free=None if base.free is None else again[id(base.free)], fit=again[id(base.fit)])
+
+
 def with_noise_around(fit: FittedModel, declared: Mapping[str, float], settings: NoiseSettings) -> FittedModel:
     """Return a fit at the same parameters, along the observer of its most likely noise.
 

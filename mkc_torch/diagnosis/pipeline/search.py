@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from functools import partial
 
@@ -11,6 +10,7 @@ import torch
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import (
     ProcessNoiseFit,
+    at_half_step,
     choose_input_hold,
     fit_alone,
 )
@@ -42,9 +42,7 @@ def stepwise_search(problem: Problem, known: PartialResult, baseline: ProcessNoi
     if baseline.fit.model.prepared.dynamics is not None:
         whole = partial(search_models, baseline, terms, options, generator, known.keep_search)
         search = known.continued("searching models", whole)
-        repeated = known.improved(
-            "halving the step of integration", partial(at_smaller_step, problem, known, search), search
-        )
+        repeated = known.improved("halving the step of integration", partial(at_smaller_step, known, search), search)
         known.keep_search(repeated)
         return repeated
     first = partial(first_step, baseline.fit, terms, options, generator, known.keep_search)
@@ -61,25 +59,24 @@ def stepwise_search(problem: Problem, known: PartialResult, baseline: ProcessNoi
     return search
 
 
-def at_smaller_step(problem: Problem, known: PartialResult, search: StepwiseSearch) -> StepwiseSearch:
+def at_smaller_step(known: PartialResult, search: StepwiseSearch) -> StepwiseSearch:
     """Halve the step of integration and fit the findings again, as long as they depend on the step.
 
     Args:
-        problem: the input of the diagnosis.
         known: receives the fit of the simulation and the findings together, so that both have the same step.
         search: the search so far; returned if a fit at a smaller step loses the recording.
     """
-    while search.found:
-        finer = with_smaller_step(search.found[-1].fit, known.options.settings.noise)
-        if finer is None:
-            break
-        again = copy.copy(known)
+    while search.found and with_smaller_step(search.found[-1].fit, known.options.settings.noise) is not None:
         try:
-            search = with_step_of(search, fit_baseline(problem, again, finer), known.options)
+            baseline = at_half_step(known.fitted_baseline)
+            if baseline is None:
+                break
+            search = with_step_of(search, baseline, known.options)
         except NoFitError:
             break
-        again.keep_search(search)
-        vars(known).update(vars(again))
+        known.restart()
+        known.keep_baseline(baseline, with_noise=True)
+        known.keep_search(search)
     return search
 
 

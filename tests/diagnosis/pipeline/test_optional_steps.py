@@ -149,14 +149,10 @@ def test_a_lost_fit_at_a_smaller_step_leaves_the_simulation_at_the_step_of_the_f
     known.keep_search(before)
     known.keep_baseline("coarse", with_noise=True)
     found = SimpleNamespace(found=[SimpleNamespace(fit=None)])
-
-    def fit_baseline(_, scratch, prepared):
-        scratch.keep_baseline(prepared, with_noise=True)
-
     monkeypatch.setattr(search_stage, "with_smaller_step", lambda *_: "fine")
-    monkeypatch.setattr(search_stage, "fit_baseline", fit_baseline)
+    monkeypatch.setattr(search_stage, "at_half_step", lambda _: "fine")
     monkeypatch.setattr(search_stage, "with_step_of", lambda *_: failing(NoFitError("lost"))())
-    assert search_stage.at_smaller_step(None, known, found) is found
+    assert search_stage.at_smaller_step(known, found) is found
     assert (known.search, known.baseline) == (before, "coarse")
 
 
