@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Literal
 
@@ -83,6 +83,15 @@ class FitAssessment:
         if not poor_fits(self.follows, settings.followed):
             return False
         return self.explained is None or self.explained < settings.useful
+
+    def unfit_with(self, grades: Sequence[Grade], settings: EvidenceSettings) -> bool:
+        """Whether findings of these grades leave differential equations unfit that are unfit without them.
+
+        They make them usable if the first is named, since the others are built on it, and if every output then follows.
+        """
+        if self.noise is None or not replace(self, corrected=()).unfit(settings):
+            return False
+        return not any(found in NAMED for found in grades[:1]) or bool(poor_fits(self.corrected, settings.followed))
 
 
 @dataclass(frozen=True)

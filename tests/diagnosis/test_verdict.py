@@ -1,6 +1,7 @@
 """The verdict, from assessments made by hand."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -139,3 +140,20 @@ def test_slow_sensor_noise_is_unexplained_only_without_findings():
     slow = noise(Disturbance("angle", False, 1.0, 0.3))
     assert verdict(assessed(GOOD_FIT, corrected=(GOOD_FIT,), noise=slow), FIRST) == "explained"
     assert verdict(assessed(GOOD_FIT, noise=slow)) == "unexplained"
+
+
+@pytest.mark.parametrize(
+    ("grades", "corrected", "unfit"),
+    [
+        (("left_out", "nearest"), GOOD_FIT, False),
+        (("nearest", "left_out"), GOOD_FIT, True),
+        (("left_out",), make_goodness_of_fit(residual=0.2, explained=0.45), True),
+        ((), GOOD_FIT, True),
+    ],
+)
+def test_findings_make_a_simulation_usable_if_the_first_is_named_and_every_output_follows(grades, corrected, unfit):
+    limits = EvidenceSettings()
+    poor = assessed(POOR_FIT, POOR_FIT, corrected=(GOOD_FIT, corrected), noise=noise())
+    assert poor.unfit_with(grades, limits) is unfit
+    assert not replace(poor, noise=None).unfit_with(grades, limits)
+    assert not assessed(GOOD_FIT, corrected=(corrected,), noise=noise()).unfit_with(grades, limits)

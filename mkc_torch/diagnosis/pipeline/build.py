@@ -37,7 +37,6 @@ from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import NamingSettings, NoiseSettings
 from mkc_torch.diagnosis.verdict import (
-    NAMED,
     FitAssessment,
     Remainder,
     decisions_on_all,
@@ -158,10 +157,8 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
     unfit = known.unfit(settings.evidence)
     count = 0 if unfit else len(case.found)
     graded = [_graded(case.found, number, final, whole, answers) for number in range(count)]
-    without = replace(known, corrected=())
-    if without.unfit(settings.evidence) and not any(finding.grade in NAMED for finding, _ in graded[:1]):
-        # findings next to one that is not to be used make no simulation usable
-        unfit, known, graded = True, without, []
+    if known.unfit_with([finding.grade for finding, _ in graded], settings.evidence):
+        unfit, known, graded = True, replace(known, corrected=()), []
     findings = tuple(finding for finding, decided in graded if not is_dropped(decided))
     without_size = tuple(finding for finding, decided in graded if is_dropped(decided))
     diagnosis = Diagnosis(
