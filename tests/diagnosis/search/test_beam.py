@@ -264,3 +264,38 @@ def test_the_models_without_one_of_the_effects_are_known_afterwards():
     assert all(beam.models[other.key] is other for other in less)
     again = beam.with_one_less(model)
     assert all(first is second for first, second in zip(less, again, strict=True))
+
+
+@functools.cache
+def searched_without_gains(leads: bool) -> BeamSearch:
+    """Return a search in which no addition to a model with effects pays by its linear gain."""
+    fit = start(DRAG, FRICTION)
+    terms = cart_terms(fit, *NAMES)
+    friction = next(term for term in terms if term.effect.id == "coulomb_friction")
+    beam = beam_of(fit, terms)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(beam_module, "PAYS", 1e6)
+        beam.run(fit, (friction,) if leads else ())
+    return beam
+
+
+@pytest.mark.parametrize("leads", [False, True])
+def test_a_leader_of_the_screening_is_tried_next_to_the_best_model_whatever_its_linear_gain(leads):
+    moves = [model.move for model in searched_without_gains(leads).models.values() if len(effects_of(model)) == 2]
+    assert ("add coulomb_friction@speed" in moves) is leads
+
+
+def test_effects_of_the_best_model_are_exchanged_for_others_of_the_same_channels():
+    beam = searched_without_gains(True)
+    assert effects_of(beam.best) == {"quadratic_drag", "coulomb_friction"}
+    others = [model for model in beam.models.values() if len(effects_of(model)) == 2 and model is not beam.best]
+    assert any(model.move.startswith("exchange ") for model in others)
+
+
+def test_the_typical_size_ignores_outliers():
+    residual = torch.ones(50, 1, dtype=torch.float64)
+    outliers = residual.clone()
+    outliers[:5] = 100.0
+    clean, hit = stub((), 0.0, residual), stub((), 0.0, outliers)
+    assert clean.log_typical_size == hit.log_typical_size == 0.0
+    assert hit.log_size > 3.0

@@ -8,6 +8,7 @@ import torch
 from mkc_torch import diagnose
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, at_half_step
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.estimate import with_smaller_step
 from mkc_torch.diagnosis.settings import Settings
@@ -103,3 +104,13 @@ def test_the_sizes_of_a_flexible_shaft_do_not_depend_on_the_sampling(recording):
     for name, truth in {"share": SHARE, "period": PERIOD, "damping": DAMPING}.items():
         value, error = sizes[name]
         assert abs(value - truth) < max(3.0 * error, 0.01 * truth), name
+
+
+def test_the_simulation_alone_is_fitted_again_with_half_the_step(recording):
+    alone = fitted(JointModel(Drive().prepare(recording)), torch.tensor([INERTIA, LOSS, 0.0], dtype=torch.float64))
+    again = at_half_step(ProcessNoiseFit(alone, alone, None))
+    assert again.fit is again.free
+    assert again.fit.model.prepared.parts == 2 * alone.model.prepared.parts
+    torch.testing.assert_close(again.fit.parameters, alone.parameters, rtol=0.05, atol=0.05)
+    given = fitted(JointModel(GivenStep().prepare(recording)), alone.parameters)
+    assert at_half_step(ProcessNoiseFit(given, given, None)) is None
