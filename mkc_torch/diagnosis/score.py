@@ -26,12 +26,13 @@ from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE_RATE
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.draws import drawn
+from mkc_torch.simulation.dynamics.entries import typical_gains
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
 from mkc_torch.simulation.dynamics.horizons import horizons_of, log_likelihood_ahead, per_sample
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid, key_of
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel
-from mkc_torch.simulation.dynamics.ports import RATES
+from mkc_torch.simulation.dynamics.ports import ENTRY, RATES
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -294,12 +295,14 @@ def is_implausible(fit: FittedModel, basis: ScoreBasis) -> bool:
     signals = model.signals(fit.parameters)
     for term, gamma in zip(model.terms, model.gammas(fit.parameters), strict=True):
         port = prepared.ports[term.port]
-        if port.kind in RATES and port.channels[0] in largest:
-            signal = signals[term.port]
-            change = term.effect.change(gamma, term.shape, term.context(prepared, signal))[:, 0].detach()
-            usual = float(change.abs().nan_to_num(torch.inf).quantile(_USUAL))
-            if not usual <= IMPLAUSIBLE_RATE * largest[port.channels[0]]:
-                return True
+        if port.kind not in (*RATES, ENTRY):
+            continue
+        signal = signals[term.port]
+        change = term.effect.change(gamma, term.shape, term.context(prepared, signal))[:, 0].detach()
+        usual = float(change.abs().nan_to_num(torch.inf).quantile(_USUAL))
+        gains = typical_gains(prepared.open_loop(), port.channels[0]) if port.kind == ENTRY else {port.channels[0]: 1.0}
+        if any(not gain * usual <= IMPLAUSIBLE_RATE * largest[name] for name, gain in gains.items() if name in largest):
+            return True
     return False
 
 

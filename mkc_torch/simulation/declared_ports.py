@@ -68,6 +68,7 @@ def _of_equations(system: Dynamics) -> dict[str, Port]:
         system=system,
         recording=recording,
         channels=outputs,
+        known=known,
         kinematic=kinematic(system, known),
         guess=signs.unsqueeze(-1).expand(2, len(system.states)),
         clock=SignalTimes(signs, number, number, torch.zeros(2, dtype=torch.float64)),

@@ -83,6 +83,7 @@ class Port:
         allows_drift: whether the noise model allows for drift at this port.
         pointwise: whether a change of a sample changes the residual of this sample only.
         kind: an effect is tried at every port of its kind; default the port's name.
+        stands_for: another kind of ports, whose effects are tried here too; default none.
         carries: names of the signal's components; default the channels.
         parts: roles of the signal's components, such as ``{"own": "speed", "position": "angle"}``.
         part_units, sizes: units and sizes of the parts.
@@ -102,6 +103,7 @@ class Port:
     allows_drift: bool = False
     pointwise: bool = True
     kind: str = ""
+    stands_for: str = ""
     carries: tuple[str, ...] = ()
     parts: Mapping[str, str] = field(default_factory=dict)
     part_units: Mapping[str, str] = field(default_factory=dict)

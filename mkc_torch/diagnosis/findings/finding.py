@@ -178,7 +178,8 @@ def places_of(term: Term, channels: Sequence[str]) -> tuple[str, ...]:
     """Return the places on which a term acts: channels of a residual, or rates and inputs of a simulation."""
     if "rate of " in term.at or term.at.startswith("exchange of "):
         return tuple(f"rate of {name}" for name in channels)
-    return tuple(f"input {name}" for name in channels) if term.at.startswith("input ") else tuple(channels)
+    at_input = term.at.startswith(("input ", "entry of "))
+    return tuple(f"input {name}" for name in channels) if at_input else tuple(channels)
 
 
 def _own(final: FinalEstimate, number: int) -> tuple[Tensor, Tensor]:

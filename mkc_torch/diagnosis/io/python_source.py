@@ -12,12 +12,13 @@ from mkc_torch.diagnosis.model.joint import in_order_of_the_chain
 from mkc_torch.effects.kinds import zero_of
 from mkc_torch.recording.recording import DEFAULT_UNITS
 from mkc_torch.simulation.dynamics.definition import Dynamics
+from mkc_torch.simulation.dynamics.entries import entries
 from mkc_torch.simulation.dynamics.ports import memory_at
 from mkc_torch.simulation.dynamics.surroundings import surroundings
 from mkc_torch.simulation.dynamics.user_functions import kinematic
 from mkc_torch.simulation.fmu import is_of_an_fmu
 from mkc_torch.simulation.load import file_of
-from mkc_torch.simulation.parameter import Parameter
+from mkc_torch.simulation.parameter import Parameter, known_parameters
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -68,11 +69,13 @@ def python_source(
     rates: list[str] = []
     memories = {name: like for term in terms for name, like in _memories(term).items()}
     inputs: list[str] = []
+    entering: list[str] = []
     outputs: list[str] = []
     for number in in_order_of_the_chain(terms, range(len(terms))):
         term, gamma = terms[number], gammas[number]
         lines = _lines(term, [_rounded(float(value)) for value in gamma], system, measured)
-        place = outputs if term.port == "output" else inputs if term.port.startswith("input ") else rates
+        kinds = {"output": outputs, "input": inputs, "entry": entering}
+        place = kinds.get(term.port.partition(" ")[0], rates)
         if place is outputs and outputs:
             place.append("y = dict(shown)")  # the next effect acts on these outputs
         place += [f"# {term.effect.id}: {term.effect.equation}", *lines]
@@ -88,7 +91,8 @@ def python_source(
         *_hold(system, holds),
         *_states(system, memories, theta),
         *_actuator(inputs),
-        *_derivative(memories, rates),
+        *_entering(entering),
+        *_derivative(memories, rates, "self.entering(time, x, u, p)" if entering else "u"),
         *_sensor(outputs),
     ]
     text = "\n".join(body)
@@ -181,8 +185,15 @@ def _actuator(inputs: list[str]) -> list[str]:
     return ["", "    def actuator(self, time, u, p, run):", *(f"        {line}" for line in lines)]
 
 
-def _derivative(memories: Mapping[str, str], rates: list[str]) -> list[str]:
-    if not rates:
+def _entering(entering: list[str]) -> list[str]:
+    if not entering:
+        return []
+    lines = ["acting = SimpleNamespace(**vars(u))", *entering, "return acting"]
+    return ["", "    def entering(self, time, x, u, p):", *(f"        {line}" for line in lines)]
+
+
+def _derivative(memories: Mapping[str, str], rates: list[str], acting: str) -> list[str]:
+    if not rates and acting == "u":
         return []
     still = [f'rates["{name}"] = torch.zeros_like(x.{name})' for name in memories]
     return [
@@ -191,7 +202,7 @@ def _derivative(memories: Mapping[str, str], rates: list[str]) -> list[str]:
         *(f"        {line}" for line in ["rates = self.plain_rates(time, x, u, p)", *still, *rates, "return rates"]),
         "",
         "    def plain_rates(self, time, x, u, p):",
-        "        rates = super().derivative(time, x, u, p)",
+        f"        rates = super().derivative(time, x, {acting}, p)",
         '        return dict(rates) if hasattr(rates, "keys") else dict(zip(self.states, rates))',
     ]
 
@@ -230,6 +241,12 @@ def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Seque
         first, _, other = term.port.removeprefix("exchange of ").partition(" and ")
         targets = [f'rates["{first}"]', f'rates["{other}"]']
         names = {"own": f"x.{first}", "other": f"x.{other}"}
+    elif term.port.startswith("entry of "):
+        name = term.port.removeprefix("entry of ")
+        known = known_parameters(system.name, system.parameters)
+        speed = entries(system, known, kinematic(system, known))[name]
+        targets = [f"acting.{name}"]
+        names = _parts(speed, system)
     elif term.port.startswith("input "):
         name = term.port.removeprefix("input ")
         targets, names = [f"acting.{name}"], {"own": f"acting.{name}"}
@@ -246,11 +263,8 @@ def _signed(expression: str) -> str:
 
 def _parts(state: str, system: Dynamics) -> dict[str, str]:
     """Return expressions of the quantities that an effect on a rate uses."""
-    known = {
-        name: parameter if isinstance(parameter, Parameter) else Parameter(parameter)
-        for name, parameter in system.parameters.items()
-    }
-    position = next((name for name, rate in kinematic(system, known).items() if rate == state), state)
+    rates = kinematic(system, known_parameters(system.name, system.parameters))
+    position = next((name for name, rate in rates.items() if rate == state), state)
     zero = zero_of(system.units.get(state, DEFAULT_UNITS.get(state, "")))
     return {
         "own": f"x.{state}",

@@ -114,7 +114,7 @@ def ports_of(effect: Effect, ports: Mapping[str, Port]) -> tuple[str, ...]:
     return tuple(
         name
         for name, port in ports.items()
-        if effect.port in (name, port.kind)
+        if effect.port in (name, port.kind, port.stands_for)
         and set(effect.needs) <= set(port.parts)
         and set(port.parts).isdisjoint(effect.excludes)
     )

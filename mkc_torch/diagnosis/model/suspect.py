@@ -192,7 +192,7 @@ def short_name(effect: Effect, port: str) -> str:
         >>> short_name(InputLag(), "input torque"), short_name(Coupling(), "exchange of warm and cold")
         ('torque', 'warm and cold')
     """
-    for prefix in (f"{effect.port} of ", f"{effect.port} "):
+    for prefix in (f"{effect.port} of ", f"{effect.port} ", "entry of "):
         if port.startswith(prefix) and port != prefix:
             return port.removeprefix(prefix)
     return port

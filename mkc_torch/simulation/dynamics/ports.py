@@ -1,4 +1,4 @@
-"""Ports of a system of differential equations, where effects act: rates, exchanges, inputs and outputs."""
+"""Ports of a system of differential equations, where effects act: rates, exchanges, inputs, their entries, outputs."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from torch import Tensor
 
 from mkc_torch.effects.kinds import CELSIUS, kind_of
 from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.dynamics.entries import entries
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.surroundings import surroundings
+from mkc_torch.simulation.parameter import Parameter
 from mkc_torch.simulation.ports import Port, SignalSizes, SignalTimes
 
 if TYPE_CHECKING:
@@ -28,6 +30,9 @@ _MEMORIES: Mapping[str, Mapping[str, bool]] = {
 
 RATES = ("rate", "loaded rate", *_MEMORIES, "exchange")
 """Kinds of ports at which an effect adds to rates of change."""
+
+ENTRY = "entry"
+"""Kind of the ports where effects of a rate add to an input, which moves several rates."""
 
 _REVERSED = 0.05
 """Share of the recording for which a state must be positive, and negative, to count as reversing."""
@@ -44,6 +49,7 @@ class PortContext:
         system: the equations.
         recording: the recording.
         channels: the columns that are outputs.
+        known: the parameters.
         kinematic: state whose rate is another state, to that state.
         guess: (N, n), a first guess of the states at the samples.
         clock: the times at which rates and inputs are computed.
@@ -53,13 +59,17 @@ class PortContext:
     system: Equations
     recording: Recording
     channels: tuple[str, ...]
+    known: Mapping[str, Parameter]
     kinematic: Mapping[str, str]
     guess: Float[Tensor, "N n"]
     clock: SignalTimes
     run: Int[Tensor, " N"]
 
     def ports(self) -> dict[str, Port]:
-        """The ports: the rate of each state, exchanges between states of the same unit, each input, and the outputs."""
+        """The ports: rates of states, exchanges between states of the same unit, inputs, their entries, and outputs.
+
+        Where an input moves one rate only, an effect at its entry would be the same as at the rate, and has no port.
+        """
         system = self.system
         places = {}
         for state in system.states:
@@ -97,11 +107,22 @@ class PortContext:
                 clock=self.clock,
                 run=self.run[self.clock.before],
             )
+        places |= {f"entry of {name}": self._entry_port(name, speed) for name, speed in self._entries().items()}
         parts = {"own": self.channels[0], **{f"output {name}": name for name in self.channels[1:]}}
         units = {part: self._unit_of(name) for part, name in parts.items()}
         unit = common_unit(self._unit_of(name) for name in self.channels)
         output = Port(self.channels, unit, pointwise=False, parts=parts, part_units=units, run=self.run)
         return places | {"output": output}
+
+    def _entries(self) -> dict[str, str]:
+        """Inputs that move several rates, to the state that is the speed there; inputs of the surroundings left out."""
+        found = entries(self.system, self.known, self.kinematic)
+        return {name: speed for name, speed in found.items() if name not in self._surroundings.values()}
+
+    def _entry_port(self, name: str, speed: str) -> Port:
+        parts = {part: of for part, of in self._parts(speed).items() if part != "surroundings"}
+        port = self._rate_port(speed, ENTRY, parts)
+        return replace(port, channels=(name,), unit=self._unit_of(name), stands_for="rate")
 
     def _remembering(self, parts: Mapping[str, str]) -> tuple[str, ...]:
         """Kinds of ports with internal states at the rate of a state with these parts."""

@@ -26,13 +26,13 @@ from mkc_torch.simulation.dynamics.first_parameters import first_parameters
 from mkc_torch.simulation.dynamics.observed import ObservedDynamics
 from mkc_torch.simulation.dynamics.observer import Observer
 from mkc_torch.simulation.dynamics.own_offsets import equations_with_offsets
-from mkc_torch.simulation.dynamics.ports import RATES, PortContext, common_unit
+from mkc_torch.simulation.dynamics.ports import ENTRY, RATES, PortContext, common_unit
 from mkc_torch.simulation.dynamics.refinement import FINEST, enough_parts
 from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
 from mkc_torch.simulation.dynamics.settings import HORIZON
 from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory, marched, solve, stations
 from mkc_torch.simulation.dynamics.user_functions import kinematic, namespace
-from mkc_torch.simulation.parameter import Parameter
+from mkc_torch.simulation.parameter import known_parameters
 from mkc_torch.simulation.ports import Answer, Changes, Nearby, Port, SignalTimes
 from mkc_torch.simulation.runs import experiment_runs
 from mkc_torch.simulation.undetermined import undetermined
@@ -57,10 +57,7 @@ class PreparedDynamics(ObservedDynamics):
         self.measured = recording.stack(*outputs)
         self.unit = common_unit(system.units.get(name, recording.units[name]) for name in outputs)
         self.independent = (True,) * len(outputs)
-        self.known = {
-            name: parameter if isinstance(parameter, Parameter) else Parameter(float(parameter))
-            for name, parameter in system.parameters.items()
-        }
+        self.known = known_parameters(system.name, system.parameters)
         self.begins, self.labels = beginnings(recording, system)
         self.run = experiment_runs(recording)
         self.input_hold = dict.fromkeys(system.inputs, system.input_hold)
@@ -177,9 +174,16 @@ class PreparedDynamics(ObservedDynamics):
 
     @cached_property
     def ports(self) -> dict[str, Port]:
-        """The ports: the rate of each state, exchanges between states of the same unit, each input, and the outputs."""
+        """The ports: rates of states, exchanges between states of the same unit, inputs, their entries, and outputs."""
         places = PortContext(
-            self.system, self.recording, self.channels, self.kinematic, self.guess[self.rows], self.clock, self.run
+            self.system,
+            self.recording,
+            self.channels,
+            self.known,
+            self.kinematic,
+            self.guess[self.rows],
+            self.clock,
+            self.run,
         )
         return places.ports()
 
@@ -282,11 +286,11 @@ class PreparedDynamics(ObservedDynamics):
         at_stations = stations(self.rate(theta, changes), found.states, self.grid.step.unsqueeze(-1), jump)
         at_stations = at_stations[:, : len(self.system.states)]
         outputs = self._outputs(theta, self.acting_at_samples(theta, changes), found.states[self.rows])
-        rates = self._rates(theta, at_stations, inputs)
+        rates = self._rates(theta, at_stations, self._entered(at_stations, inputs, changes))
         at = {
             name: self._signal(port, theta, at_stations, inputs, rates)
             for name, port in self.ports.items()
-            if port.kind in RATES
+            if port.kind in (*RATES, ENTRY)
         }
         at |= {f"input {name}": self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
         return at | {"output": outputs}
@@ -353,7 +357,7 @@ class PreparedDynamics(ObservedDynamics):
 
         def rate(states: Tensor) -> Tensor:
             own, memories, disturbances = states.split([n, len(rows) - n, len(lasting)], -1)
-            plain = self._rates(theta, own, inputs)
+            plain = self._rates(theta, own, self._entered(own, inputs, changes))
             rates = [*plain, *(torch.zeros_like(memory) for memory in memories.unbind(-1))]
             for port, places, name in acting:
                 signal = self._signal(port, theta, own, inputs, plain)
@@ -368,6 +372,15 @@ class PreparedDynamics(ObservedDynamics):
             return torch.stack(rates, -1)
 
         return rate
+
+    def _entered(self, states: Tensor, inputs: Tensor, changes: Changes) -> Float[Tensor, "S u"]:
+        """The acting inputs with the effects at their entries, which depend on the states."""
+        added = {name: changes[f"entry of {name}"] for name in self.system.inputs if f"entry of {name}" in changes}
+        if not added:
+            return inputs
+        signal = torch.cat([states, inputs], -1)
+        columns = zip(self.system.inputs, inputs.unbind(-1), strict=True)
+        return torch.stack([own + added[name](signal)[:, 0] if name in added else own for name, own in columns], -1)
 
     def _rates(self, theta: Tensor, states: Tensor, inputs: Tensor) -> list[Tensor]:
         """Rates of the states by the simulation's own equations."""

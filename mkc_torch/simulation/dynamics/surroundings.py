@@ -11,7 +11,7 @@ from mkc_torch.recording.recording import DEFAULT_UNITS
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.user_functions import namespace
 from mkc_torch.simulation.names import Names
-from mkc_torch.simulation.parameter import Parameter
+from mkc_torch.simulation.parameter import Parameter, known_parameters
 
 _SHIFT = 0.7
 """Common shift of state and input in the test."""
@@ -37,22 +37,20 @@ def surroundings(system: Equations) -> dict[str, str]:
         >>> surroundings(Heater())
         {'temp': 'outside'}
     """
-    known = {
-        name: parameter if isinstance(parameter, Parameter) else Parameter(parameter)
-        for name, parameter in system.parameters.items()
-    }
+    known = known_parameters(system.name, system.parameters)
     found = {}
     for state in system.states:
-        unit = _unit_of(system, state)
-        alike = [other for other in system.states if other == state or (unit and _unit_of(system, other) == unit)]
+        unit = unit_of(system, state)
+        alike = [other for other in system.states if other == state or (unit and unit_of(system, other) == unit)]
         shifted = [name for name in system.inputs if _shifts(system, known, state, alike, name)]
-        same = [name for name in system.inputs if unit and _unit_of(system, name) == unit]
+        same = [name for name in system.inputs if unit and unit_of(system, name) == unit]
         if shifted or same:
             found[state] = (shifted or same)[0]
     return found
 
 
-def _unit_of(system: Equations, name: str) -> str:
+def unit_of(system: Equations, name: str) -> str:
+    """The unit that a system declares for a state or an input, or the default of the name; empty without either."""
     return system.units.get(name, DEFAULT_UNITS.get(name, ""))
 
 
