@@ -93,7 +93,7 @@ class Score:
 
     Attributes:
         by_horizon: log-likelihood of the recording from predictions over each horizon.
-        numbers: price of the fitted numbers of effects and noise, and of holds other than the simulation's own.
+        numbers: price of the fitted numbers of effects and noise.
         terms: price of the choice of effects.
         disturbances: price of the disturbances of the noise.
         forms: price of forms that include others as special cases, and of curves without a name.
@@ -213,7 +213,6 @@ def score(fit: FittedModel, basis: ScoreBasis, settings: Settings, near: Sequenc
     noise, by_horizon = best
     disturbances = len(noise.components)
     numbers = sum(fit.model.sizes) + sum(len(term.effect.fitted_shape) for term in fit.model.terms)
-    numbers += _changed_holds(fit)
     forms = sum(
         settings.naming.is_generalisation * term.effect.is_generalisation
         + settings.naming.nameless * term.effect.is_curve
@@ -256,13 +255,6 @@ def separation(best: Score | None, other: Score | None, basis: ScoreBasis) -> fl
     away = away - away.mean()
     error = math.sqrt(float(away @ away) * variance_ratio([away], len(away) // 10))
     return min(gap / basis.kappa, 0.5 * gap * abs(gap) / error**2) if error > 0.0 else gap / basis.kappa
-
-
-def _changed_holds(fit: FittedModel) -> int:
-    """Number of inputs whose hold differs from the simulation's own: a number chosen by the recording."""
-    prepared = fit.model.prepared.dynamics
-    assert prepared is not None
-    return sum(how != prepared.system.input_hold for how in prepared.input_hold.values())
 
 
 def _noise_numbers(noise: NoiseModel) -> int:

@@ -67,6 +67,10 @@ KEPT = 0.5
 """Share of the gain over the simulation alone that a fit under process noise may lose to the open-loop fit. By
 judgement."""
 
+HOLD = 1.0
+"""Nats that another hold of an input than the simulation's own has to gain: where the two fit alike, rounding would
+choose. More would keep a wrong hold, whose error resembles physics. By judgement."""
+
 FAR_LESS = 0.3
 """Ratio of open-loop residuals with and without an effect below which the effect is mentioned though no finding.
 

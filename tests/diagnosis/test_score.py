@@ -37,15 +37,6 @@ class Slide(Dynamics):
         return {"position": x.speed, "speed": -p.stiffness * x.position - p.damping * x.speed}
 
 
-class Pulled(Slide):
-    """The same body with a force on it."""
-
-    inputs = ("force",)
-
-    def derivative(self, time, x, u, p):
-        return {"position": x.speed, "speed": u.force - p.stiffness * x.position - p.damping * x.speed}
-
-
 class SlowSlide(Slide):
     """The same body with time in other units."""
 
@@ -206,19 +197,3 @@ def test_the_variance_ratio_of_overlapping_sums_is_their_length() -> None:
 def test_the_price_of_a_number_is_half_the_logarithm_of_the_samples_times_kappa() -> None:
     basis = ScoreBasis((1,), np.ones(1), np.ones((100, 1)), 100, 3.0, 0.0, (0.0,), {}, np.ones(2))
     assert basis.number == pytest.approx(1.5 * math.log(100))
-
-
-@pytest.mark.parametrize("own", ["linear", "held"])
-def test_a_hold_that_follows_no_better_than_the_simulations_own_costs_a_number(own: str) -> None:
-    """A constant force is the same under both holds."""
-    clock, position = slid(0)
-    simulation = Pulled()
-    simulation.input_hold = own
-    prepared = simulation.prepare(Recording({"time": clock, "position": position, "force": torch.zeros(N)}))
-    alone = fitted(JointModel(prepared), prepared.start())
-    basis = basis_of(alone, 10, {}, Settings())
-    other = prepared.with_input_hold({"force": "held" if own == "linear" else "linear"})
-    scores = [score(replace(alone, model=JointModel(held)), basis, Settings()) for held in (prepared, other)]
-    assert scores[0] is not None
-    assert scores[1] is not None
-    assert scores[0].value - scores[1].value == pytest.approx(basis.number, abs=1e-6)

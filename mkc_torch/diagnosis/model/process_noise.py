@@ -17,6 +17,7 @@ from mkc_torch.diagnosis.model.fit import FittedModel, fitted, no_first_fit
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.settings import NoiseSettings
+from mkc_torch.diagnosis.thresholds import HOLD
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.first_fit import multiple_shooting_start, with_strong_observer
 from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, most_likely_noise
@@ -360,7 +361,7 @@ def choose_input_hold(
     """Return the fit with the best hold of each input, constant or linear between samples.
 
     Args:
-        base: the fit with the simulation's own holds.
+        base: the fit with the simulation's own holds, which are kept where the gain is below ``HOLD``.
         declared: known standard deviations of the outputs' white noise.
         fixed: inputs whose hold is known.
         settings: of the noise.
@@ -371,8 +372,8 @@ def choose_input_hold(
         others = [hold for hold in ("held", "linear") if hold != how] if name not in fixed else []
         works = [partial(_holding, base, name, other, declared, settings) for other in others]
         tried = [found for found in run_parallel(works, prepared) if found is not None]
-        if tried:
-            base = max([base, *tried], key=value)
+        best = max(tried, key=value, default=base)
+        base = best if value(best) > value(base) + HOLD else base
     return _with_sizes(base)
 
 

@@ -41,7 +41,7 @@ from mkc_torch.diagnosis.search.moves import (
     with_wide_grid,
 )
 from mkc_torch.diagnosis.settings import Settings
-from mkc_torch.diagnosis.thresholds import IMPROVING, LARGER, LEAST_WIDTH, MOST_MODELS, MOST_TERMS, PAYS, WIDTH
+from mkc_torch.diagnosis.thresholds import HOLD, IMPROVING, LARGER, LEAST_WIDTH, MOST_MODELS, MOST_TERMS, PAYS, WIDTH
 from mkc_torch.nonlinear import NoFitError
 
 _ADDITIONS = (12, 5, 3, 2, 2, 2)
@@ -382,17 +382,20 @@ class BeamSearch:
         return self._better(model, noisy, less)
 
     def with_best_hold(self, model: Candidate, fixed: Mapping[str, str]) -> Candidate:
-        """Return a model with the hold of each input that scores highest; without the effects another may have.
+        """Return a model with the hold of each input that scores highest; the simulation's own within ``HOLD``.
 
         Args:
-            model: the model.
+            model: the model; with its effects another hold may score highest than without them.
             fixed: inputs whose hold is known.
         """
-        for name, how in model.fit.model.prepared.input_hold.items():
+        dynamics = model.fit.model.prepared.dynamics
+        assert dynamics is not None
+        for name, how in dynamics.input_hold.items():
             for other in ("held", "linear"):
                 if name not in fixed and other != how:
                     held = fitted_held(model.fit, name, other)
-                    model = model if held is None else self._better(model, held)
+                    less = HOLD if other == dynamics.system.input_hold else -HOLD
+                    model = model if held is None else self._better(model, held, less)
         return model
 
     def simplified(self, model: Candidate) -> Candidate:
