@@ -31,7 +31,8 @@ from mkc_torch.diagnosis.model.process_noise import fit_alone
 from mkc_torch.diagnosis.model.shapes import candidates_of
 from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
 from mkc_torch.diagnosis.score import basis_of
-from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate
+from mkc_torch.diagnosis.search.beam import BeamSearch
+from mkc_torch.diagnosis.search.candidate import Candidate
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.recording.recording import Recording

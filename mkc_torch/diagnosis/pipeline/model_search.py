@@ -29,7 +29,8 @@ from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.pipeline.suspected import suspected_models
 from mkc_torch.diagnosis.pipeline.trail import trail_of
 from mkc_torch.diagnosis.score import basis_of, score, separation
-from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate, in_order
+from mkc_torch.diagnosis.search.beam import BeamSearch
+from mkc_torch.diagnosis.search.candidate import Candidate, in_order
 from mkc_torch.diagnosis.search.columns import best_change
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.run import SearchResult
@@ -129,7 +130,7 @@ def _beam(base: ProcessNoiseFit, first: SearchResult, terms: tuple[Term, ...], o
     start = _start(base)
     basis = basis_of(base.fit, len({term.key for term in terms}), options.declared, options.settings)
     leaders = [terms[rival.number] for rival in first.ranking[: options.settings.search.own_noise]]
-    beam = BeamSearch(terms, basis, options.settings, options.declared)
+    beam = BeamSearch(terms, basis, options.settings, options.declared, fixed=options.fixed)
     beam.noisy = base.fit if has_process_noise(base.fit) and not options.quick else None
     significant = first.p_value <= options.level
     if options.quick:
@@ -323,7 +324,7 @@ def _final(step: Candidate, beam: BeamSearch, options: SearchOptions, *, last: b
     gained = step.value - beam.models[()].value
     less = max(options.settings.naming.separable * beam.basis.kappa, KEPT * gained)
     whole = beam.simplified(beam.to_the_end(step))
-    whole = beam.with_best_hold(whole, options.fixed) if last else whole
+    whole = beam.with_best_hold(whole) if last else whole
     noisy = beam.under_noise(whole, less)
     if noisy is not whole or has_process_noise(whole.fit):
         return noisy

@@ -16,7 +16,8 @@ from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.optional import optional
 from mkc_torch.diagnosis.parts import EffectParameter
 from mkc_torch.diagnosis.pipeline.trail import scored_model
-from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate
+from mkc_torch.diagnosis.search.beam import BeamSearch
+from mkc_torch.diagnosis.search.candidate import Candidate
 from mkc_torch.diagnosis.search.estimate import estimate, rough_estimate
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import NoFitError

@@ -9,7 +9,8 @@ from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import refit_open_loop
 from mkc_torch.diagnosis.model.suspect import suspect_id
 from mkc_torch.diagnosis.score import Score
-from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate, model_key
+from mkc_torch.diagnosis.search.beam import BeamSearch
+from mkc_torch.diagnosis.search.candidate import Candidate, model_key
 
 
 def trail_of(beam: BeamSearch, chosen: FittedModel | None) -> tuple[ScoredModel, ...]:

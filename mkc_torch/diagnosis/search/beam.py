@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 
 import torch
 
@@ -15,12 +15,12 @@ from mkc_torch.diagnosis.model.fit import (
     fitted,
     fitted_with_effect,
 )
-from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise, has_process_noise
 from mkc_torch.diagnosis.model.shapes import shape_fitted, with_profiled_shape
 from mkc_torch.diagnosis.model.suspect import suspect_id
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
-from mkc_torch.diagnosis.score import Score, ScoreBasis, is_implausible, score
+from mkc_torch.diagnosis.score import ScoreBasis, is_implausible, score
+from mkc_torch.diagnosis.search.candidate import Candidate, ModelKey, in_order, model_key
 from mkc_torch.diagnosis.search.move_fits import (
     POLISHED,
     at_initial_values,
@@ -59,60 +59,6 @@ _LEADERS = (3, 1, 0)
 _NOISY = 3
 """Number of leading models that are also fitted under their process noise."""
 
-ModelKey = tuple[tuple[Key, bool], ...]
-"""Identity of a model: its effects with their places in series, in a fixed order."""
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A fitted and scored model.
-
-    Attributes:
-        fit: in open loop, or along the simulation's observer if no open loop is found.
-        score: None where the model loses the recording.
-        move: how the search came to it.
-    """
-
-    fit: FittedModel
-    score: Score | None
-    move: str
-
-    @property
-    def value(self) -> float:
-        """The score in nats."""
-        return -float("inf") if self.score is None else self.score.value
-
-    @property
-    def price(self) -> float:
-        """The price of the model's numbers, effects and noise in nats."""
-        return float("inf") if self.score is None else self.score.log_likelihood - self.score.value
-
-    @property
-    def key(self) -> ModelKey:
-        """Identity of the model."""
-        return model_key(self.fit.model.terms)
-
-    @cached_property
-    def log_size(self) -> float:
-        """Mean over the outputs of the log RMS of the open-loop residual; infinite if it loses the recording."""
-        free = self.fit.open_loop
-        if free is None:
-            return math.inf
-        return float(free.residual.square().mean(0).clamp(min=1e-300).sqrt().log().mean())
-
-    @cached_property
-    def log_typical_size(self) -> float:
-        """As :attr:`log_size`, of the median of the absolute residual: outliers do not count."""
-        free = self.fit.open_loop
-        if free is None:
-            return math.inf
-        return float(free.residual.abs().median(0).values.clamp(min=1e-300).log().mean())
-
-
-def model_key(terms: Iterable[Term]) -> ModelKey:
-    """Return the identity of a model with these effects."""
-    return tuple(sorted((term.key, term.first) for term in terms))
-
 
 @dataclass
 class BeamSearch:
@@ -127,6 +73,7 @@ class BeamSearch:
         most_terms: largest number of effects of a model.
         most_models: largest number of models that the search tries.
         noisy: the simulation alone under its process noise; None without.
+        fixed: inputs whose hold is known.
     """
 
     terms: tuple[Term, ...]
@@ -137,6 +84,7 @@ class BeamSearch:
     most_terms: int = MOST_TERMS
     most_models: int = MOST_MODELS
     noisy: FittedModel | None = None
+    fixed: Mapping[str, str] = field(default_factory=dict)
 
     def run(self, start: FittedModel, further: Sequence[Term] = ()) -> Candidate:
         """Search from the simulation alone; return the model with the highest score.
@@ -148,6 +96,7 @@ class BeamSearch:
         self._keep([Candidate(start, score(start, self.basis, self.settings), "")])
         terms = with_wide_grid(self.terms, start.model.prepared)
         expanded: set[ModelKey] = set()
+        held: set[ModelKey] = set()
         most = self.most_models - int(IMPROVING * self.most_models)
         while len(self.models) < most:
             waiting = [(rank, model) for rank, model in enumerate(self.beam()) if model.key not in expanded]
@@ -156,6 +105,7 @@ class BeamSearch:
             for rank, model in waiting:
                 expanded.add(model.key)
                 self._expand(model, rank, terms, further, most)
+            self._hold_best(held)
         self._improve(terms, further, expanded)
         self._under_noise()
         return self.best
@@ -242,12 +192,21 @@ class BeamSearch:
                 rest = [other for other in fit.model.terms if other is not term]
                 works.append((model_key(rest), f"drop {self._id(term)}", partial(fitted_without, fit, number)))
             for other in special_cases(term, self.terms, fit.model.prepared):
+                if other.key in {known.key for known in fit.model.terms}:
+                    continue
                 rest = [*fit.model.terms[:number], *fit.model.terms[number + 1 :], other]
                 move = f"exchange {self._id(term)} for {self._id(other)}"
                 works.append((model_key(rest), move, partial(fitted_exchanged, fit, number, self._all(other))))
         orders = in_other_orders(fit)
         works += [(model_key(o), "another order in series", partial(fitted_reordered, fit, o)) for o in orders]
         self._fit(works, fit, most)
+
+    def _hold_best(self, held: set[ModelKey]) -> None:
+        """Exchange the holds of the inputs of the best model: missing physics can resemble the error of a hold."""
+        best = self.best
+        if best.fit.model.terms and best.key not in held:
+            held.add(best.key)
+            self.models[best.key] = self.with_best_hold(best)
 
     def _improve(self, terms: Sequence[Term], further: Sequence[Term], expanded: set[ModelKey]) -> None:
         """Expand the best model, and exchange its effects for others of the same channels, as long as that helps."""
@@ -381,18 +340,13 @@ class BeamSearch:
             return model
         return self._better(model, noisy, less)
 
-    def with_best_hold(self, model: Candidate, fixed: Mapping[str, str]) -> Candidate:
-        """Return a model with the hold of each input that scores highest; the simulation's own within ``HOLD``.
-
-        Args:
-            model: the model; with its effects another hold may score highest than without them.
-            fixed: inputs whose hold is known.
-        """
+    def with_best_hold(self, model: Candidate) -> Candidate:
+        """Return a model with the hold of each input that scores highest; the simulation's own within ``HOLD``."""
         dynamics = model.fit.model.prepared.dynamics
         assert dynamics is not None
         for name, how in dynamics.input_hold.items():
             for other in ("held", "linear"):
-                if name not in fixed and other != how:
+                if name not in self.fixed and other != how:
                     held = fitted_held(model.fit, name, other)
                     less = HOLD if other == dynamics.system.input_hold else -HOLD
                     model = model if held is None else self._better(model, held, less)
@@ -424,24 +378,6 @@ class BeamSearch:
             return model
         other = replace(model, fit=fit, score=score(fit, self.basis, self.settings))
         return other if other.value > model.value - less else model
-
-
-def in_order(model: Candidate, terms: Sequence[Term]) -> Candidate:
-    """Return a model with its effects in another order of their numbers; effects in series keep the order they act in.
-
-    Args:
-        model: the model.
-        terms: effects of the same identities, in the wanted order.
-    """
-    fit = model.fit
-    own = {term.key: number for number, term in enumerate(fit.model.terms)}
-    order = [own[term.key] for term in terms]
-    if order == sorted(order):
-        return model
-    gammas = fit.model.gammas(fit.parameters)
-    ordered = JointModel(fit.model.prepared, [fit.model.terms[number] for number in order], fit.model.near)
-    parameters = torch.cat([fit.parameters[: fit.model.base], *[gammas[number] for number in order]])
-    return replace(model, fit=replace(fit, model=ordered, parameters=parameters))
 
 
 def _place_of(term: Term, groups: Sequence[Sequence[Term]]) -> int:

@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from mkc_torch import Recording, diagnose
+from mkc_torch.diagnosis.model.process_noise import choose_input_hold, fit_alone
+from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects.dynamics.dead_zone import DeadZone
 from mkc_torch.simulation import Dynamics, Parameter
 
@@ -46,3 +48,17 @@ def test_the_hold_is_chosen_again_with_the_effect():
     assert found.verdict == "explained"
     width = next(p for p in found.findings[0].parameters if p.name == "width")
     assert width.value == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize(("more", "expected"), [(0.9, "linear"), (1.1, "held")])
+def test_another_hold_than_the_simulations_own_has_to_gain_a_nat(more, expected):
+    """Where both fit alike, the errors of rounding would choose."""
+    prepared = Tanks().prepare(recorded(100))
+    base = fit_alone(prepared, {}, NoiseSettings(), lambda *_, **__: None)
+
+    def value(fits):
+        return more * (fits.fit.model.prepared.input_hold == {"valve": "held"})
+
+    found = choose_input_hold(base, {}, {}, NoiseSettings(), value)
+    assert found.fit.model.prepared.input_hold == {"valve": expected}

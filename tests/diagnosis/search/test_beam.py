@@ -13,7 +13,8 @@ from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.score import basis_of, score
 from mkc_torch.diagnosis.search import beam as beam_module
-from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate, in_order, model_key
+from mkc_torch.diagnosis.search.beam import BeamSearch
+from mkc_torch.diagnosis.search.candidate import Candidate, in_order, model_key
 from mkc_torch.diagnosis.search.move_fits import at_initial_values
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE_RATE, LARGER
