@@ -262,7 +262,9 @@ def with_step_of(search: StepwiseSearch, base: ProcessNoiseFit, options: SearchO
     ground = base.fit if base.free is None else base.free
     found, evidence = [], [_evidence(search, ground, options)]
     for located in search.found:
-        model = JointModel(prepared, located.fit.model.terms)
+        # an effect may have chosen another hold of an input than the simulation alone
+        holds = located.fit.model.prepared.input_hold
+        model = JointModel(prepared.with_input_hold(holds), located.fit.model.terms)
         fit = shape_fitted(fitted(model, located.fit.parameters, located.fit.bound))
         if has_process_noise(located.fit):
             fit = fit_with_process_noise(fit, options.declared, options.settings.noise).fit

@@ -120,12 +120,14 @@ def rolled(seed: int, friction: float, tilt: float = 0.0, noise: float = 0.002) 
 
 
 @pytest.mark.e2e
-def test_friction_of_a_cart_is_found_at_the_force_and_exported(tmp_path) -> None:
-    recording = rolled(1, friction=0.3)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_friction_of_a_cart_is_found_at_the_force_and_exported(seed: int, tmp_path) -> None:
+    recording = rolled(seed, friction=0.3)
     found = diagnose(Cart(), recording, effects=(CoulombFriction(),), surrogates=39, max_findings=1)
     assert [(f.effect, f.channels) for f in found.findings] == [("coulomb_friction", ("input force",))]
     friction = found.findings[0].parameters[0]
     assert friction.unit == "N"
+    assert found.environment.input_hold == {"force": "held"}
     assert friction.value == pytest.approx(0.3, abs=4.0 * friction.standard_error + 0.003)
     assert ("coulomb_friction@force",) in {model.terms for model in found.decisions.models}
     assert all(len(set(model.terms)) == len(model.terms) for model in found.decisions.models)
