@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 
@@ -91,15 +92,28 @@ def search_models(
     if first.p_value > options.level:
         follow = _follow(beam) if not options.quick else ()
         return replace(search, left=(), first=replace(first, follow=follow))
+    tested = partial(_tested, search, beam=beam, base=base, options=options, generator=generator, keep=keep)
     for chain in _in_turn(beam):
-        found = _tested(search, chain, beam, base, options, generator, keep)
-        for other in _other_ways(chain, len(found.found), beam):
-            again = _tested(search, other, beam, base, options, generator, keep)
+        found = _in_either_way(chain, beam, tested)
+        # a simpler rival whose effects are not all significant is none
+        if 0 < len(found.found) < len(chain) and beam.best.key != chain[-1].key:
+            again = _in_either_way(_chain(beam.best, beam), beam, tested)
             found = again if len(again.found) > len(found.found) else found
         if found.found or not found.unconfirmed:
             return found
         search = replace(search, unconfirmed=search.unconfirmed or found.unconfirmed)
     return replace(search, left=())
+
+
+def _in_either_way(
+    chain: Sequence[Candidate], beam: BeamSearch, tested: Callable[[Sequence[Candidate]], StepwiseSearch]
+) -> StepwiseSearch:
+    """Test a chain of models, and if an effect is not significant another chain; return the longer result."""
+    found = tested(chain)
+    for other in _other_ways(chain, len(found.found), beam):
+        again = tested(other)
+        found = again if len(again.found) > len(found.found) else found
+    return found
 
 
 def _screened(
