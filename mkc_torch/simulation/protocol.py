@@ -40,6 +40,7 @@ class ClosedForm(ABC):
     jacobian: Jacobian = "forward"
     observer: Observer | None = None
     dynamics: PreparedDynamics | None = None
+    recorded: Bool[Tensor, "N m"] | None = None
 
     @abstractmethod
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
@@ -95,6 +96,8 @@ class PreparedSimulation(Protocol):
         warnings: sentences about what the recording does not determine.
         state: constants that a :class:`Correction` needs in addition to the parameters; JSON-serialisable.
         measured: (N, k), the recorded columns that the residual is computed of.
+        recorded: (N, m), False where an output is missing and its residual is that of the nearest recorded sample; None
+            where none is missing.
         faults: sentences about faults of the recording with which no comparison is meaningful; usually empty.
         input_hold: "held", "linear" or "smooth" for each input that is used between samples.
         own_offsets: offsets of the outputs in single recordings, where several are diagnosed together.
@@ -130,6 +133,8 @@ class PreparedSimulation(Protocol):
     def state(self) -> Mapping[str, object]: ...
     @property
     def measured(self) -> Float[Tensor, "N k"]: ...
+    @property
+    def recorded(self) -> Bool[Tensor, "N m"] | None: ...
     @property
     def faults(self) -> tuple[str, ...]: ...
     @property

@@ -111,7 +111,7 @@ def held_out(
     for number, (out, *density, _) in enumerate(folds):
         seen = blocks.fold == number
         residual[seen] = out[seen]
-        log_likelihood[seen] = scored(out, *density)[seen]
+        log_likelihood[seen] = scored(out, *density, fit.recorded)[seen]
     _, sigma, d, _, parameters = zip(*folds, strict=True)
     middle = torch.stack(sigma).median(0).values, torch.stack(d).median(0).values
     left_out = 1.0 - float(torch.stack(blocks.train).double().mean())
@@ -120,13 +120,16 @@ def held_out(
 
 def on_all(fit: FittedModel) -> Evidence:
     """Score a fit on its training samples, in place of held-out blocks."""
-    log_likelihood = scored(fit.residual, fit.sigma, fit.d, fit.bound)
+    log_likelihood = scored(fit.residual, fit.sigma, fit.d, fit.bound, fit.recorded)
     return Evidence(log_likelihood, fit.residual, fit.sigma, fit.d, fit.parameters.unsqueeze(0), 0.5)
 
 
-def scored(residual: Tensor, sigma: Tensor, d: Tensor, bound: Tensor) -> Float[Tensor, " N"]:
-    """Return the log-likelihood of each sample, summed over channels."""
-    return -mkc_nll(residual, sigma, d, bound).sum(-1)
+def scored(
+    residual: Tensor, sigma: Tensor, d: Tensor, bound: Tensor, recorded: Bool[Tensor, "N m"] | None = None
+) -> Float[Tensor, " N"]:
+    """Return the log-likelihood of each sample, summed over the channels that are recorded there."""
+    lost = mkc_nll(residual, sigma, d, bound)
+    return -(lost if recorded is None else recorded * lost).sum(-1)
 
 
 _DRAWS = 2000

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -164,14 +164,15 @@ def _trials(prepared: PreparedDynamics) -> list[_Trial]:
 
     if bool(torch.cat(prepared.bounds).isfinite().any()):
         trials.append(_Trial(of_signs, freed, thorough=True))
+    known = prepared.known_inputs.inputs
     for number, name in enumerate(prepared.system.inputs):
-        turned = prepared.inputs_at_rows.clone()
+        turned = known.clone()
         turned[:, number] = -turned[:, number]
         trials.append(_Trial(_always(f"With the sign of `{name}` reversed,"), _with_inputs(prepared, turned)))
-        step = float(prepared.time.diff().median())
-        for lag in (lag for lag in LAGS if lag < len(prepared.time) // 10):
-            late = prepared.inputs_at_rows.clone()
-            late[lag:, number] = prepared.inputs_at_rows[:-lag, number]
+        step = float(prepared.known_inputs.time.diff().median())
+        for lag in (lag for lag in LAGS if lag < len(known) // 10):
+            late = known.clone()
+            late[lag:, number] = known[:-lag, number]
             text = f"With `{name}` delayed by {lag * step:.3g} s,"
             trials.append(_Trial(_always(text), _with_inputs(prepared, late)))
     return trials
@@ -181,15 +182,16 @@ def _always(text: str) -> Callable[[Tensor], str]:
     return lambda _: text
 
 
-def _still(prepared: PreparedDynamics, number: int) -> Float[Tensor, "N u"]:
-    inputs = prepared.inputs_at_rows.clone()
+def _still(prepared: PreparedDynamics, number: int) -> Float[Tensor, "R u"]:
+    inputs = prepared.known_inputs.inputs.clone()
     inputs[:, number] = inputs[:, number].mean()
     return inputs
 
 
-def _with_inputs(prepared: PreparedDynamics, inputs: Float[Tensor, "N u"]) -> PreparedDynamics:
+def _with_inputs(prepared: PreparedDynamics, inputs: Float[Tensor, "R u"]) -> PreparedDynamics:
     other = copy.copy(prepared)
-    other.inputs_at_rows = inputs
+    other.known_inputs = replace(prepared.known_inputs, inputs=inputs)
+    other.inputs_at_rows = inputs[prepared.known_inputs.samples]
     return other.with_input_hold({})
 
 

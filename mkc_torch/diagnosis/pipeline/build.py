@@ -288,7 +288,7 @@ def _clearly_better(fits: Sequence[FittedModel], number: int, naming: NamingSett
     before, after = fits[number], fits[number + 1]
     numbers = after.model.sizes[-1] + len(after.model.terms[-1].effect.fitted_shape)
     price = 0.5 * numbers * math.log(len(after.residual)) + naming.separable
-    return agreed_innovation_gain(before.residual, after.residual) > price
+    return agreed_innovation_gain(before.residual, after.residual, after.recorded) > price
 
 
 def _assessment(whole: DiagnosisInputs) -> FitAssessment:

@@ -55,7 +55,7 @@ def _holds(
     if first:
         plain = located.beyond > settings.beyond_doubt and high > 0.0
         price = 0.5 * located.fit.model.sizes[-1] * math.log(len(after.log_likelihood))
-        return gain > 0.0 or plain or innovation_gain(before.residual, after.residual) > price
+        return gain > 0.0 or plain or innovation_gain(before.residual, after.residual, located.fit.recorded) > price
     return low > 0.0 or (gain > 0.0 and located.beyond > settings.further)
 
 
