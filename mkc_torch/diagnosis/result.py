@@ -43,6 +43,7 @@ from mkc_torch.diagnosis.suspected_sentences import suspected_sentences
 from mkc_torch.effects import words_of
 from mkc_torch.recording.disturbance import RejectedInterval
 from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.start_checks import StartCheck
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -200,6 +201,7 @@ class Diagnosis:
         recordings: names of the recordings that were diagnosed together; empty for a single recording.
         quick: True for a quick look, which draws no surrogates: no p-values, and an unknown rate of false alarms.
         stop: why the search was stopped before its end, and what was not done; None if it was not stopped.
+        checks: checks of the simulation's own parameters before the search.
         decisions: the models that were scored, and the decisions that findings, grades and verdict follow from.
 
     Example:
@@ -242,6 +244,7 @@ class Diagnosis:
     stop: Stop | None = None
     notes: tuple[str, ...] = ()
     decisions: Trail = field(default_factory=Trail)
+    checks: tuple[StartCheck, ...] = ()
 
     def __repr__(self) -> str:
         found = ", ".join(finding.effect for finding in self.findings) or "nothing found"

@@ -108,12 +108,12 @@ def held_out(
         return found.residual, found.sigma, found.d, found.bound, found.parameters
 
     folds = run_parallel([partial(without, train) for train in blocks.train], fit.model.prepared, thing="part held out")
-    for number, (out, *density, _) in enumerate(folds):
+    for number, (out, sigma, d, bound, _) in enumerate(folds):
         seen = blocks.fold == number
         residual[seen] = out[seen]
-        log_likelihood[seen] = scored(out, *density, fit.recorded)[seen]
-    _, sigma, d, _, parameters = zip(*folds, strict=True)
-    middle = torch.stack(sigma).median(0).values, torch.stack(d).median(0).values
+        log_likelihood[seen] = scored(out, sigma, d, bound, fit.recorded)[seen]
+    _, sigmas, scales, _, parameters = zip(*folds, strict=True)
+    middle = torch.stack(sigmas).median(0).values, torch.stack(scales).median(0).values
     left_out = 1.0 - float(torch.stack(blocks.train).double().mean())
     return Evidence(log_likelihood, residual, *middle, torch.stack(parameters), left_out)
 

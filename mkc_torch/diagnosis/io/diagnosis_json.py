@@ -26,6 +26,7 @@ from mkc_torch.diagnosis.result import (
     Number,
 )
 from mkc_torch.diagnosis.verdict import conclusion
+from mkc_torch.simulation.start_checks import StartCheck
 
 _MOST_POINTS = 500
 """Largest number of samples of a disturbance that are written."""
@@ -85,6 +86,17 @@ def _by_place(processes: Iterable[ProcessNoise]) -> dict[str, Any]:
         else:
             found[process.place] = content
     return found
+
+
+def checks_json(check: StartCheck) -> dict[str, Any]:
+    """Return a check of the simulation's parameters before the search; keys that do not apply are absent.
+
+    Example:
+        >>> checks_json(StartCheck("no output", ("bias",), "`bias` changes no output in this recording."))
+        {'kind': 'no output', 'parameters': ['bias'], 'sentence': '`bias` changes no output in this recording.'}
+    """
+    content = {**asdict(check), "parameters": list(check.parameters), "combination": check.combination or None}
+    return {name: value for name, value in content.items() if value is not None}
 
 
 def recordings_json(environment: NoiseEnvironment) -> dict[str, Any]:
@@ -206,6 +218,7 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "verdict": d.verdict,
         "doubts": conclusion(d).doubts,
         "goodness_of_fit": goodness_of_fit_json(d.environment),
+        "before_the_search": [checks_json(check) for check in d.checks],
         "reasons": d.environment.reasons,
         **recordings_json(d.environment),
         "noise": _noise(d.noise) | noise_json(d.environment),

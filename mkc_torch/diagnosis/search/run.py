@@ -178,9 +178,7 @@ def _scene(
         best, terms, tangents = _with_tangents(fits, terms, settings)
         around = best
     tangents = replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
-    return best, SearchProblem(
-        base, around, terms, tangents, *_unmasked(around), settings
-    )
+    return best, SearchProblem(base, around, terms, tangents, *_unmasked(around), settings)
 
 
 def _unmasked(fit: FittedModel) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:

@@ -28,7 +28,11 @@ def usable_rows(recording: Recording, inputs: Sequence[str], outputs: Sequence[s
 
     Example:
         >>> nan = float("nan")
-        >>> columns = {"time": torch.arange(3.0), "u": torch.tensor([0.0, 1.0, nan]), "y": torch.tensor([0.1, nan, 0.3])}
+        >>> columns = {
+        ...     "time": torch.arange(3.0),
+        ...     "u": torch.tensor([0.0, 1.0, nan]),
+        ...     "y": torch.tensor([0.1, nan, 0.3]),
+        ... }
         >>> usable_rows(Recording(columns), ["u"], ["y"])["time"].tolist()
         [0.0, 1.0]
     """
@@ -48,9 +52,7 @@ def usable_rows(recording: Recording, inputs: Sequence[str], outputs: Sequence[s
     return used.rows(torch.arange(len(used)), *map(Note, notes)).sorted_by_time()
 
 
-def filled(
-    values: Float[Tensor, "N m"], time: Float[Tensor, " N"], begins: Bool[Tensor, " N"]
-) -> Float[Tensor, "N m"]:
+def filled(values: Float[Tensor, "N m"], time: Float[Tensor, " N"], begins: Bool[Tensor, " N"]) -> Float[Tensor, "N m"]:
     """Replace missing values by a line through their neighbours in the same run; the median in a run without any.
 
     Only first guesses use the replaced values.

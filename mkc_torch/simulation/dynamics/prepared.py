@@ -17,6 +17,7 @@ from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.continuation import Meaning, is_plain
 from mkc_torch.simulation.dynamics.between_samples import inputs_between
+from mkc_torch.simulation.dynamics.checked import AT_START, CheckedDynamics
 from mkc_torch.simulation.dynamics.checks import SampledStates, check_functions
 from mkc_torch.simulation.dynamics.compiled.faithful import is_faithful
 from mkc_torch.simulation.dynamics.compiled.residual import CompiledDynamics, compiled_dynamics
@@ -25,7 +26,6 @@ from mkc_torch.simulation.dynamics.first_guess import despiked, first_guess
 from mkc_torch.simulation.dynamics.first_parameters import first_parameters
 from mkc_torch.simulation.dynamics.layout import InputRows, lay_out
 from mkc_torch.simulation.dynamics.missing import MissingOutputs, with_lines
-from mkc_torch.simulation.dynamics.observed import ObservedDynamics
 from mkc_torch.simulation.dynamics.observer import Observer
 from mkc_torch.simulation.dynamics.own_offsets import equations_with_offsets
 from mkc_torch.simulation.dynamics.ports import RATES, PortContext, common_unit
@@ -35,9 +35,8 @@ from mkc_torch.simulation.dynamics.settings import HORIZON
 from mkc_torch.simulation.dynamics.trajectory import Trajectory, marched, solve, stations
 from mkc_torch.simulation.dynamics.user_functions import kinematic, namespace
 from mkc_torch.simulation.parameter import Parameter
-from mkc_torch.simulation.ports import Answer, Changes, Nearby, Port, SignalTimes
+from mkc_torch.simulation.ports import Answer, Changes, Nearby, Port
 from mkc_torch.simulation.runs import experiment_runs
-from mkc_torch.simulation.undetermined import undetermined
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -45,11 +44,8 @@ if TYPE_CHECKING:
 _PATIENT = 2
 """Stride of the growing horizon, in grid times, for trajectories that are hard to solve."""
 
-_NOUGHT = 1e-3
-"""Share of a parameter's start value below which its fitted value does not define its size."""
 
-
-class PreparedDynamics(ObservedDynamics):
+class PreparedDynamics(CheckedDynamics):
     """A system of differential equations with its recording; implements the protocol of a prepared simulation."""
 
     def __init__(self, system: Equations, recording: Recording, outputs: tuple[str, ...]) -> None:
@@ -84,7 +80,6 @@ class PreparedDynamics(ObservedDynamics):
         any_value = [torch.inf] * len(starts)
         self.bounds = self.time.new_tensor([*low, *(-x for x in any_value)]), self.time.new_tensor(high + any_value)
         self.prior = _prior_within(*self.bounds)
-        self._p = len(self.known)
         self.clean = torch.stack([despiked(self.recording[name], self.time, self.begins) for name in outputs], -1)
         self.counts = self.clean == self.measured
         if self.missing is not None:
@@ -130,7 +125,7 @@ class PreparedDynamics(ObservedDynamics):
         other = copy.copy(self)
         other.input_hold = {**self.input_hold, **between}
         other.inputs = other._between(self.known_inputs.inputs)
-        for known in ("_start", "warnings"):
+        for known in AT_START:
             other.__dict__.pop(known, None)
         return other
 
@@ -140,7 +135,7 @@ class PreparedDynamics(ObservedDynamics):
             return None
         other = copy.copy(self)
         other._lay_out(2 * self.parts)
-        for known in ("_start", "warnings"):
+        for known in AT_START:
             other.__dict__.pop(known, None)
         return other
 
@@ -187,38 +182,13 @@ class PreparedDynamics(ObservedDynamics):
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:
         return self.observed(None)._start.clone()
 
-    @property
-    def given(self) -> Float[Tensor, " p"]:
-        """The user's values, then the first guess of the initial states."""
-        values = self.time.new_tensor([parameter.value for parameter in self.known.values()])
-        return torch.cat([values, self.guess[self.grid.begins].flatten()])
-
     @cached_property
     def _start(self) -> Float[Tensor, " p"]:
         def rate(theta: Tensor) -> Callable[[Tensor], Tensor]:
             return self.rate(theta, {})
 
         residual, step = partial(self.residual, changes={}), self.grid.step.unsqueeze(-1)
-        return first_parameters(self.given, self.bounds, self._p, rate, self.guess, step, residual)
-
-    @cached_property
-    def warnings(self) -> tuple[str, ...]:
-        """Warnings about parameters that the recording does not determine, near the start of the fit."""
-        if not self._p:
-            return ()
-        if self.observer is not None:
-            return self.observed(None).warnings
-        load_forward_mode()
-        theta = self.start()
-        near = self.trajectory(theta, {})
-        residual = dual_constants(lambda values: self.residual(values, {}, near))
-        tangents = torch.func.jacfwd(residual)(theta).flatten(0, 1)
-        # a value near 0 does not define the parameter's size
-        meant = theta.new_tensor([parameter.value for parameter in self.known.values()])
-        typical = self.guess.abs().median(0).values.repeat(int(self.begins.sum()))
-        meant = torch.cat([meant.abs(), typical])
-        size = torch.where(theta.abs() < _NOUGHT * meant, meant, theta.abs())
-        return undetermined(tangents, size, self.parameter_names, self._p)
+        return first_parameters(self.given, self.bounds, len(self.known), rate, self.guess, step, residual)
 
     def answer(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Answer:
         """The residual and the trajectory; see :meth:`mkc_torch.simulation.PreparedSimulation.answer`."""
@@ -336,7 +306,7 @@ class PreparedDynamics(ObservedDynamics):
         """Initial states of the runs, with internal states, and the state that each internal state starts equal to."""
         memories = [like for memory in self.remembering(changes).values() for like in memory.values()]
         memories += [""] * len(self.lasting)
-        begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
+        begin = theta[len(self.known) :].unflatten(0, (-1, len(self.system.states)))
         return self.with_memories(begin, memories), memories
 
     def rate(self, theta: Tensor, changes: Changes, inputs: Tensor | None = None) -> Callable[[Tensor], Tensor]:

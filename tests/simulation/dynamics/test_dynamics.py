@@ -700,15 +700,6 @@ class TestActuatorsAndSensors:
         assert sizes["share"].value == pytest.approx(share, abs=0.01)
         assert sizes["lag"].value == pytest.approx(lag, abs=1.5)
 
-    def test_a_change_of_an_input_at_a_dropped_sample_is_reported(self):
-        """A step of the torque at a sample without an angle comes a sample late; a slope does not."""
-        torque = (TIME[49] < TIME).astype(float)
-        angle = TRUTH[0].copy()
-        angle[[20, 50]] = np.nan
-        for values, count in ((torque, 1), (TIME / TIME[-1], 0)):
-            warnings = instance(Driven).prepare(table(time=TIME, angle=angle, torque=values)).recording.warnings
-            assert sum("`torque` changes at 1 of the dropped samples" in warning for warning in warnings) == count
-
     def test_an_actuator_that_omits_an_input_raises(self):
         with pytest.raises(SimulationError, match=r"actuator does not return the input `torque`"):
             instance(Driven, actuator=lambda *_: {}).prepare(table(**VALID, torque=0.0 * TIME))
