@@ -22,8 +22,11 @@ _NOTHING = 1e-9
 _TOGETHER = 0.98
 """Absolute correlation of two estimates from which only a combination of them counts as determined. Judgement."""
 
-_JITTER = 1e-13
-"""Share of the largest curvature that keeps directions without any curvature finite."""
+_JITTER = 1e-7
+"""Share of the largest singular value at which smaller ones are limited."""
+
+_COLLINEAR = 0.9999
+"""The same with all other parameters of the equations known: these two alone act only together. Judgement."""
 
 _SINGLE = 0.02
 """Largest share of a second undetermined direction's variance in the first's with which quotients are named."""
@@ -121,7 +124,7 @@ def parameter_checks(
     idle = (torch.linalg.vector_norm(columns, dim=0) / math.sqrt(max(len(columns), 1)) < _NOTHING).tolist()
     found = [_idle(name, used=used(number)) for number, name in enumerate(known) if idle[number]]
     acting = [number for number in range(columns.shape[1]) if not idle[number]]
-    return (*found, *_pairs(at, columns[:, acting], acting, known, residual))
+    return (*found, *_together_checks(at, acting, known, residual))
 
 
 def _idle(name: str, *, used: bool) -> StartCheck:
@@ -132,34 +135,49 @@ def _idle(name: str, *, used: bool) -> StartCheck:
     return StartCheck("no equation", (name,), text)
 
 
-def _pairs(
-    at: Sensitivity,
-    columns: Float[Tensor, "R q"],
-    acting: Sequence[int],
-    known: Sequence[str],
-    residual: Callable[[Tensor], Tensor],
+def _together_checks(
+    at: Sensitivity, acting: Sequence[int], known: Sequence[str], residual: Callable[[Tensor], Tensor]
 ) -> list[StartCheck]:
-    """Return the pairs of parameters whose estimates are correlated, under white noise of each output."""
-    gram = columns.mT @ columns
-    if not acting:
-        return []
-    gram = gram + _JITTER * gram.diagonal().amax() * torch.eye(len(gram), dtype=gram.dtype)
-    covariance = torch.linalg.inv(gram)
-    error = covariance.diagonal().clamp(min=1e-300).sqrt()
-    correlation = covariance / (error.unsqueeze(-1) * error)
-    own = [place for place, number in enumerate(acting) if number < len(known)]
-    found = []
+    """Return the parameters that act only together: collinear pairs, then groups with correlated estimates.
+
+    Of a collinear pair the second stays as it is for the checks that follow.
+    """
+    columns, found = at.relative, []
+    free = list(acting)
+    others = [number for number in free if number >= len(known)]
+    for a, b in combinations([number for number in acting if number < len(known)], 2):
+        if a in free and b in free:
+            covariance, correlation = _estimates(columns, [a, b, *others])
+            if abs(float(correlation[0, 1])) > _COLLINEAR:
+                determined = torch.linalg.eigh(covariance[:2, :2]).eigenvectors[:, 0]
+                text = _combination(at, (a, b), known, determined, residual)
+                found.append(_check((known[a], known[b]), text, float(correlation[0, 1])))
+                free.remove(b)
+    own = [place for place, number in enumerate(free) if number < len(known)]
+    covariance, correlation = _estimates(columns, free)
     for group in _groups(correlation, own):
-        names = tuple(known[acting[place]] for place in group)
+        names = tuple(known[free[place]] for place in group)
         values, directions = torch.linalg.eigh(covariance[group][:, group])
         if len(group) == 2:
-            pair = acting[group[0]], acting[group[1]]
-            text = _combination(at, pair, known, directions[:, 0], residual)
+            text = _combination(at, (free[group[0]], free[group[1]]), known, directions[:, 0], residual)
         else:
             text = _quotients(names, directions[:, -1]) if values[-2] < _SINGLE * values[-1] else ""
         strongest = correlation[group][:, group] - torch.eye(len(group), dtype=correlation.dtype)
-        found.append(_together(names, text, float(strongest.flatten()[strongest.abs().argmax()])))
+        found.append(_check(names, text, float(strongest.flatten()[strongest.abs().argmax()])))
     return found
+
+
+def _estimates(
+    columns: Float[Tensor, "R p"], numbers: Sequence[int]
+) -> tuple[Float[Tensor, "q q"], Float[Tensor, "q q"]]:
+    """Return covariance and correlation of the estimates of some parameters under white noise, all others known."""
+    chosen = columns[:, list(numbers)]
+    scale = torch.linalg.vector_norm(chosen, dim=0).clamp(min=1e-300)
+    _, length, directions = torch.linalg.svd(torch.linalg.qr(chosen / scale, mode="r").R)
+    inverse = directions.mT / length.clamp(min=_JITTER * float(length.amax()))
+    covariance = (inverse @ inverse.mT) / (scale.unsqueeze(-1) * scale)
+    error = covariance.diagonal().sqrt()
+    return covariance, covariance / (error.unsqueeze(-1) * error)
 
 
 def _groups(correlation: Float[Tensor, "q q"], places: Sequence[int]) -> list[list[int]]:
@@ -189,7 +207,7 @@ def _quotients(names: Sequence[str], direction: Float[Tensor, " k"]) -> str:
     return ", ".join(parts)
 
 
-def _together(names: tuple[str, ...], combination: str, correlation: float) -> StartCheck:
+def _check(names: tuple[str, ...], combination: str, correlation: float) -> StartCheck:
     listed = f"{', '.join(f'`{name}`' for name in names[:-1])} and `{names[-1]}`"
     only = ", ".join(f"`{part}`" for part in combination.split(", "))
     text = (
@@ -208,7 +226,7 @@ def _combination(
     residual: Callable[[Tensor], Tensor],
 ) -> str:
     """Write the determined combination as a product, a quotient or a sum, whichever moves the residual less."""
-    lead = int(weights.abs().argmax())
+    lead = int(float(weights[1].abs()) > (1.0 + _WHOLE) * float(weights[0].abs()))
     first, second = places[lead], places[1 - lead]
     share = float(weights[1 - lead] / weights[lead])  # of a relative change of the second in one of the first
     theta = at.theta
@@ -222,7 +240,7 @@ def _combination(
     sum_[first] -= _MOVED * share * at.size[first]
     start = residual(theta)
     moved = [float((residual(values) - start).square().mean().nan_to_num(math.inf)) for values in (product, sum_)]
-    if bool((theta[list(places)] == 0).any()) or moved[1] < moved[0]:
+    if bool((theta[list(places)] == 0).any()) or moved[1] < 0.5 * moved[0] - _NOTHING**2:
         return f"{names[0]} {'+' if per_unit > 0 else '-'} {abs(per_unit):.3g} {names[1]}"
     sign = "*" if share > 0 else "/"
     return f"{names[0]} {sign} {_power(names[1], abs(share))}"

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.decisions import Trail
 from mkc_torch.diagnosis.environment import DisturbanceEstimate, NoiseEnvironment, ProcessNoise, ShapeCheck
+from mkc_torch.diagnosis.io.checks_json import checks_json
 from mkc_torch.diagnosis.result import (
     Diagnosis,
     EffectParameter,
@@ -26,7 +27,6 @@ from mkc_torch.diagnosis.result import (
     Number,
 )
 from mkc_torch.diagnosis.verdict import conclusion
-from mkc_torch.simulation.start_checks import StartCheck
 
 _MOST_POINTS = 500
 """Largest number of samples of a disturbance that are written."""
@@ -86,17 +86,6 @@ def _by_place(processes: Iterable[ProcessNoise]) -> dict[str, Any]:
         else:
             found[process.place] = content
     return found
-
-
-def checks_json(check: StartCheck) -> dict[str, Any]:
-    """Return a check of the simulation's parameters before the search; keys that do not apply are absent.
-
-    Example:
-        >>> checks_json(StartCheck("no output", ("bias",), "`bias` changes no output in this recording."))
-        {'kind': 'no output', 'parameters': ['bias'], 'sentence': '`bias` changes no output in this recording.'}
-    """
-    content = {**asdict(check), "parameters": list(check.parameters), "combination": check.combination or None}
-    return {name: value for name, value in content.items() if value is not None}
 
 
 def recordings_json(environment: NoiseEnvironment) -> dict[str, Any]:
