@@ -177,7 +177,7 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
         corrected=case.spread(case.held_out[-1]),
         advice=(),
         warnings=(
-            *notices(whole.stop, quick=options.quick),
+            *notices(whole.stop, quick=options.quick, too_few=options.too_few),
             *prepared.recording.warnings,
             *unit_warnings(prepared.recording),
             *(() if prepared.checks else prepared.warnings),
@@ -197,12 +197,14 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
         environment=_environment(whole, known, unfit=unfit),
         quick=options.quick,
         stop=whole.stop,
+        too_few=options.too_few,
     )
     left = Remainder(
         tuple(_structure(diagnosis, whole, first, final)),
         # for differential equations the noise model includes the correlation already
         0.0 if known.noise is not None else _lag(diagnosis),
         whole.stop,
+        (len(prepared.time), options.settings.search.fewest_samples) if options.too_few else None,
     )
     decided = (
         *(decision for _, decisions in graded for decision in decisions),

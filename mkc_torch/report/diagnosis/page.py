@@ -25,6 +25,7 @@ from mkc_torch.report.diagnosis import (
     pictures,
     summary,
     unseen,
+    untested,
     verdict,
 )
 from mkc_torch.report.drawing import themed
@@ -87,6 +88,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "", paths: verdict.Run
         unseen=unseen,
         before_search=before_search,
         environment=environment,
+        untested=untested,
         several=several,
         typeset=typeset,
         marked=marked,
