@@ -54,15 +54,17 @@ class StartCheck:
     Attributes:
         kind: "no equation", a parameter that no rate and no output uses; "no output", a parameter that changes no
             output in this recording; "only together", parameters of which only a combination is determined;
-            "at a bound", a start value at a bound, from which a fit can stall.
+            "at a bound", a start value at a bound, from which a fit can stall; "impossible value", a value of the fit
+            without effects that cannot be.
         parameters: their names.
         sentence: for the user.
         combination: the determined combination, such as ``gain * inertia``; empty for other kinds.
         correlation: of the two estimates; None for other kinds.
-        start: the start value that replaces one at a bound; None for other kinds.
+        start: the start value that replaces one at a bound, or the nominal value of an impossible one; None for other
+            kinds.
     """
 
-    kind: Literal["no equation", "no output", "only together", "at a bound"]
+    kind: Literal["no equation", "no output", "only together", "at a bound", "impossible value"]
     parameters: tuple[str, ...]
     sentence: str
     combination: str = ""

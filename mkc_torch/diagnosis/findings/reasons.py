@@ -18,6 +18,7 @@ from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.first_fit import multiple_shooting_start
+from mkc_torch.simulation.dynamics.impossible import at_bounds
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 if TYPE_CHECKING:
@@ -29,9 +30,6 @@ _NOUGHT = 1e-3
 
 _AWAY = 30.0
 """Relative value above which a parameter has diverged."""
-
-_AT_END = 1e-6
-"""Relative distance within which a parameter is at a bound."""
 
 _FIXES = 0.5
 """Relative residual below which a trial is reported as the reason."""
@@ -57,16 +55,7 @@ def at_ends(fit: FittedModel) -> tuple[str, ...]:
     prepared = fit.model.prepared.dynamics
     if prepared is None:
         return ()
-    found = []
-    for number, (name, known) in enumerate(prepared.known.items()):
-        value = float(fit.parameters[number])
-        size = max(abs(known.value), 1e-300)
-        low, high = (float(bound[number]) for bound in prepared.bounds)
-        at_low = value - low <= _AT_END * size and known.value - low > _NOUGHT * size
-        at_high = high - value <= _AT_END * size and high - known.value > _NOUGHT * size
-        if at_low or at_high:
-            found.append(name)
-    return tuple(found)
+    return tuple(dict.fromkeys(name for name, _ in at_bounds(prepared, fit.parameters)))
 
 
 def reasons_of(fits: Sequence[FittedModel], follows: Sequence[GoodnessOfFit]) -> tuple[str, ...]:

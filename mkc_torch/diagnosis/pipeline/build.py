@@ -45,8 +45,10 @@ from mkc_torch.diagnosis.verdict import (
 )
 from mkc_torch.diagnosis.vetoes import VetoContext, decisions_on, grade, is_dropped
 from mkc_torch.recording.unit_warnings import unit_warnings
+from mkc_torch.simulation.dynamics.impossible import impossible_checks, impossible_values
 from mkc_torch.simulation.dynamics.noise import sized_noise
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
+from mkc_torch.simulation.start_checks import StartCheck
 
 
 def assess_baseline(base: ProcessNoiseFit, declared: Mapping[str, float]) -> tuple[GoodnessOfFit, ...]:
@@ -192,7 +194,7 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
         separability=separability(first) if first else _nothing_to_separate(),
         traces=_traces(prepared, whole.drivers, case.base, final),
         model=model_of(final, whole.simulation),
-        checks=prepared.checks,
+        checks=(*prepared.checks, *_impossible(whole)),
         evidence=answers.of_all,
         environment=_environment(whole, known, unfit=unfit),
         quick=options.quick,
@@ -292,6 +294,15 @@ def _clearly_better(fits: Sequence[FittedModel], number: int, naming: NamingSett
     numbers = after.model.sizes[-1] + len(after.model.terms[-1].effect.fitted_shape)
     price = 0.5 * numbers * math.log(len(after.residual)) + naming.separable
     return agreed_innovation_gain(before.residual, after.residual, after.recorded) > price
+
+
+def _impossible(whole: DiagnosisInputs) -> tuple[StartCheck, ...]:
+    """Return the values of the fit without effects that cannot be."""
+    fit = whole.base.fit if whole.base.free is None else whole.base.free
+    prepared = fit.model.prepared.dynamics
+    if prepared is None:
+        return ()
+    return impossible_checks(prepared, impossible_values(prepared, fit.parameters))
 
 
 def _assessment(whole: DiagnosisInputs) -> FitAssessment:

@@ -15,6 +15,7 @@ _LABELS = {
     "no output": "no effect on an output",
     "only together": "not separable",
     "at a bound": "start at a bound",
+    "impossible value": "fitted value",
 }
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mkc_torch._support.dual_constants import dual_constants
 from mkc_torch.nonlinear import load_forward_mode
+from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.observed import ObservedDynamics
 from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory
 from mkc_torch.simulation.dynamics.user_functions import namespace
@@ -31,7 +32,9 @@ _NOUGHT = 1e-3
 class CheckedDynamics(ObservedDynamics):
     """A prepared system with the start of its fit; a derived class provides the trajectory and the residual."""
 
+    recording: Recording
     grid: Grid
+    bounds: tuple[Tensor, Tensor]
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:
         raise NotImplementedError

@@ -14,7 +14,7 @@ from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.score import basis_of, score
 from mkc_torch.diagnosis.search import beam as beam_module
 from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate, in_order, model_key
-from mkc_torch.diagnosis.search.move_fits import at_initial_values
+from mkc_torch.diagnosis.search.move_fits import at_other_values
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE_RATE, LARGER
 from mkc_torch.nonlinear import NoFitError
@@ -247,10 +247,9 @@ def test_an_effect_of_a_model_is_tried_at_other_places_whatever_its_linear_gain(
 
 def test_a_fit_far_from_its_initial_values_is_also_tried_from_there():
     fit = start(DRAG, 0.0)
-    assert at_initial_values(fit, 5.0) is None
+    assert at_other_values(fit, 5.0) == []
     away = replace(fit, parameters=torch.cat([20.0 * fit.parameters[:1], fit.parameters[1:]]))
-    there = at_initial_values(away, 5.0)
-    assert there is not None
+    (there,) = at_other_values(away, 5.0)
     torch.testing.assert_close(there.parameters, fit.model.prepared.start())
 
 
