@@ -29,7 +29,7 @@ _INSIDE = 1e-3
 """Distance of the start value from the bound, relative to itself, from which the fit has moved to the bound."""
 
 _OUTSIDE = 0.25
-"""Distance of a level from the recorded values, as a share of their range, from which it is far outside. Judgement."""
+"""Distance of a level from the recorded and nominal values, as a share of their range, if far outside. Judgement."""
 
 _LONGEST = 1e3
 """Time constant in durations of the longest run from which a decay does not show. Judgement."""
@@ -145,7 +145,8 @@ class _Equations:
         """Return the value as a level of a state that the equations count from it, if it is far outside."""
         value = float(self._theta[number])
         for state, of_level, inputs in self._levels():
-            low, high = self._range_of(state)
+            recorded, nominal = self._range_of(state), self._prepared.known[name].value
+            low, high = min(recorded[0], nominal), max(recorded[1], nominal)
             if not high > low or low - _OUTSIDE * (high - low) <= value <= high + _OUTSIDE * (high - low):
                 continue
             moved = self._theta.clone()
@@ -162,7 +163,7 @@ class _Equations:
                 change = float((plain - self._rates(possible, self._states))[:, place].mean())
                 unit = self._prepared.known[name].unit or self._prepared.system.units.get(state, "")
                 acts = 1 if change > 0.0 else -1
-                return ImpossibleValue(name, value, unit, "level", state, (low, high), acts)
+                return ImpossibleValue(name, value, unit, "level", state, recorded, acts)
         return None
 
     def _levels(self) -> Iterator[tuple[str, list[int], list[str]]]:

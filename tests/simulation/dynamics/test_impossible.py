@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mkc_torch import Recording
+from mkc_torch import Recording, diagnose
 from mkc_torch.simulation import Dynamics, Parameter
 from mkc_torch.simulation.dynamics.impossible import impossible_checks, impossible_values
 
@@ -68,6 +68,31 @@ def test_a_level_far_outside_the_recording_acts_like_a_loss_or_a_source(ambient,
     assert check.start == 22.0
     assert f"`ambient` ends at {ambient:.4g} degC" in check.sentence
     assert f"lacks something that acts like {word} of `temp`" in check.sentence
+
+
+def simulate(seed, loss):
+    """A heater by Euler's method, with a constant loss that the simulation does not have."""
+    random = np.random.default_rng(seed)
+    power = np.repeat(random.choice([0.3, 0.6, 1.0, 1.5], 15), 20)
+    temp = np.full(300, 90.0)
+    for k in range(299):
+        temp[k + 1] = temp[k] + 2.0 * (2.0 * power[k] - (temp[k] - 22.0) / 60.0 - loss)
+    columns = {"time": TIME, "power": power, "temp": temp + random.normal(0.0, 0.1, 300)}
+    return Recording({name: torch.tensor(values) for name, values in columns.items()})
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("loss", [0.0, 1.2])
+def test_a_fit_that_lacks_a_loss_ends_at_an_impossible_ambient(seed, loss):
+    system = type("HeldHeater", (Heater,), {"input_hold": "held"})()
+    checks = diagnose(system, simulate(seed, loss), effects=(), surrogates=19).checks
+    kinds = [(check.kind, check.parameters) for check in checks]
+    assert kinds == ([("impossible value", ("ambient",))] if loss else [])
+    if loss:
+        value = float(checks[0].sentence.split("ends at ")[1].split(" degC")[0])
+        assert value == pytest.approx(22.0 - 1.2 * 60.0, abs=1.0)
+        assert "acts like a loss of `temp`" in checks[0].sentence
 
 
 def test_a_nominal_value_outside_the_recording_is_the_users_choice():

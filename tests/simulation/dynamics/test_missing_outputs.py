@@ -10,7 +10,11 @@ import torch
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
-from mkc_torch import Recording
+from mkc_torch import Recording, diagnose
+from mkc_torch.effects.dynamics.constant_force import ConstantForce
+from mkc_torch.effects.dynamics.coulomb_friction import CoulombFriction
+from mkc_torch.effects.dynamics.input_delay import InputDelay
+from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 from mkc_torch.recording.recording import RecordingError
 from mkc_torch.simulation import Dynamics
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
@@ -143,8 +147,8 @@ class TestOutputsOfDifferentRates:
         torch.testing.assert_close(tangents.rows.movedim(0, -1), rows, rtol=1e-5, atol=1e-6)
 
 
-def by_hand(torque: np.ndarray, outputs: dict[int, tuple[np.ndarray, float]]) -> np.ndarray:
-    """Friction over inertia, and inertia, by least squares with SciPy on the recorded outputs alone."""
+def by_hand(torque: np.ndarray, outputs: dict[int, tuple[np.ndarray, float]]) -> float:
+    """Friction over inertia by least squares with SciPy, on the recorded outputs alone."""
 
     def left(values: np.ndarray) -> np.ndarray:
         friction, inertia, damping = values
@@ -152,4 +156,50 @@ def by_hand(torque: np.ndarray, outputs: dict[int, tuple[np.ndarray, float]]) ->
         parts = [(values - states[:, k]) / noise for k, (values, noise) in outputs.items()]
         return np.concatenate([part[np.isfinite(part)] for part in parts])
 
-    return least_squares(left, (0.3, 0.1, 0.02), x_scale=(0.1, 0.02, 0.01), diff_step=1e-3, loss="soft_l1").x
+    found = least_squares(left, (0.3, 0.1, 0.02), x_scale=(0.1, 0.02, 0.01), diff_step=1e-3)
+    return float(found.x[0])
+
+
+def recorded(kind: str, seed: int, friction: float) -> tuple[Dynamics, Recording, dict[int, tuple[np.ndarray, float]]]:
+    """A simulation, a recording with missing outputs, and these outputs at all times with their noise."""
+    random, (torque, states) = np.random.default_rng(seed + 50), truth(seed, friction)
+    angle = states[:, 0] + random.normal(0.0, 0.003, 1500)
+    speed = states[:, 1] + random.normal(0.0, 0.02, 1500)
+    rows = slice(None)
+    if kind == "slow":
+        angle = at_every(angle, 25)
+        return Disc(), table(time=TIME, torque=torque, angle=angle), {0: (angle, 0.003)}
+    if kind == "rates":
+        angle, speed = at_every(angle, 10), at_every(speed, 25)
+    else:
+        speed[500:1000] = np.nan
+        angle, speed, rows = at_every(angle, 5), at_every(speed, 5), slice(None, None, 5)
+    recording = table(rows, time=TIME, torque=torque, angle=angle, speed=speed)
+    return TwoSensors(), recording, {0: (angle, 0.003), 1: (speed, 0.02)}
+
+
+KINDS = {"a sensor slower than the input": "slow", "two rates": "rates", "a sensor that fails": "stretch"}
+CANDIDATES = (CoulombFriction(), QuadraticDrag(), InputDelay(), ConstantForce())
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+class TestDiagnosesWithMissingOutputs:
+    def test_hidden_friction_is_found_with_the_size_of_an_independent_fit(self, kind):
+        system, recording, outputs = recorded(kind, 1, 0.05)
+        found = diagnose(system, recording, effects=CANDIDATES, surrogates=19, max_findings=1)
+        assert found.verdict == "explained"
+        (finding,) = found.findings
+        assert finding.effect == "coulomb_friction"
+        (friction,) = finding.parameters
+        size = by_hand(drive(1), outputs)
+        assert friction.value == pytest.approx(0.05 / INERTIA, abs=3.0 * friction.standard_error)
+        assert friction.value == pytest.approx(size, abs=2.0 * friction.standard_error)
+
+    def test_without_friction_nothing_is_found(self, kind):
+        system, recording, _ = recorded(kind, 1, 0.0)
+        found = diagnose(system, recording, effects=CANDIDATES, surrogates=19, max_findings=1)
+        assert (found.verdict, found.findings) == ("adequate", ())
+        for fit in found.environment.goodness_of_fit:
+            assert fit.residual == pytest.approx({"angle": 0.003, "speed": 0.02}[fit.output], rel=0.25)
+            assert fit.noise_floor == pytest.approx({"angle": 0.003, "speed": 0.02}[fit.output], rel=0.25)
