@@ -116,7 +116,7 @@ def prepare(
 
 
 def _unjudged(options: SearchOptions, prepared: PreparedSimulation) -> bool:
-    return options.quick and prepared.dynamics is not None
+    return options.too_few or (options.quick and prepared.dynamics is not None)
 
 
 def subject_of(recording: Recording) -> str:

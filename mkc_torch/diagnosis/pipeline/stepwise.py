@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.evidence.held_out import (
     blocks_of,
     gain_interval,
     held_out,
+    on_all,
 )
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
@@ -84,7 +85,7 @@ def first_step(
     if terms:
         first = _located(base, terms, options, generator, keep=lambda first: keep(replace(so_far, first=first)))
     keep(replace(so_far, first=first))
-    evidence = held_out(base, blocks)
+    evidence = held_out(base, blocks) if options.judged else on_all(base)
     first_step = StepwiseSearch(first, (), None, blocks, (evidence,), terms)
     keep(first_step)
     if first is None:
