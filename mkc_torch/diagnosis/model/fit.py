@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.noise.outliers import pseudo_residual
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.functional import mkc_nll
+from mkc_torch.simulation.dynamics.missing import recorded_weight
 from mkc_torch.simulation.dynamics.other_starts import OtherStarts
 from mkc_torch.simulation.protocol import PreparedSimulation
 
@@ -172,9 +173,7 @@ def _fit(
     effort: Effort = FULL,
 ) -> FittedModel:
     way, recorded = model.continuation(), model.prepared.recorded
-    weight = rows
-    if recorded is not None:
-        weight = recorded.to(start) if rows is None else recorded * rows.unsqueeze(-1)
+    weight = rows if recorded is None else recorded_weight(recorded, rows).to(start)
     found = nonlinear.fit(
         way,
         start,

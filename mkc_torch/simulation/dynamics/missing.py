@@ -100,6 +100,22 @@ def nearest_recorded(
     return torch.stack(columns, -1)
 
 
+def recorded_weight(recorded: Bool[Tensor, "N m"], rows: Float[Tensor, " N"] | None = None) -> Float[Tensor, "N m"]:
+    """Return weights of the residuals: those of the rows where an output was recorded, else 0.
+
+    An output that was recorded in none of these rows is compared with its nearest values.
+
+    Example:
+        >>> recorded_weight(torch.tensor([[True, True], [True, False]]), torch.tensor([0.0, 1.0])).tolist()
+        [[0.0, 0.0], [1.0, 1.0]]
+    """
+    weight = recorded.double()
+    if rows is not None:
+        weight = weight * rows.unsqueeze(-1)
+        weight = torch.where(weight.sum(0) > 0, weight, rows.unsqueeze(-1))
+    return weight
+
+
 def with_lines(samples: Recording, outputs: Sequence[str], begins: Bool[Tensor, " N"]) -> Recording:
     """Return the samples with missing outputs replaced by :func:`filled`."""
     values = samples.stack(*outputs)

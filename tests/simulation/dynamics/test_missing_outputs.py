@@ -203,3 +203,18 @@ class TestDiagnosesWithMissingOutputs:
         for fit in found.environment.goodness_of_fit:
             assert fit.residual == pytest.approx({"angle": 0.003, "speed": 0.02}[fit.output], rel=0.25)
             assert fit.noise_floor == pytest.approx({"angle": 0.003, "speed": 0.02}[fit.output], rel=0.25)
+
+
+@pytest.mark.e2e
+def test_a_sensor_that_records_in_a_short_stretch_only_is_compared_there():
+    """No fold of held-out blocks but one has its values; the first run has none of them."""
+    random, (torque, states) = np.random.default_rng(4), truth(1, 0.0)
+    rows = slice(None, None, 5)
+    angle = states[:, 0] + random.normal(0.0, 0.003, 1500)
+    speed = np.full(1500, np.nan)
+    speed[1000:1060] = states[1000:1060, 1] + random.normal(0.0, 0.02, 60)
+    recording = table(rows, time=TIME, torque=torque, angle=angle, speed=speed)
+    found = diagnose(TwoSensors(), recording, effects=(CoulombFriction(),), surrogates=19, max_findings=1)
+    assert found.findings == ()
+    angle_fit, _ = found.environment.goodness_of_fit
+    assert angle_fit.residual == pytest.approx(0.003, rel=0.15)
