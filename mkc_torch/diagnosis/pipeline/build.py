@@ -182,7 +182,7 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
             *notices(whole.stop, quick=options.quick, too_few=options.too_few),
             *prepared.recording.warnings,
             *unit_warnings(prepared.recording),
-            *(() if prepared.checks else prepared.warnings),
+            *_unchecked_warnings(prepared),
             *warnings_of(whole.drivers.warnings),
             *_time_warnings(prepared),
             *evidence_warnings(answers),
@@ -294,6 +294,13 @@ def _clearly_better(fits: Sequence[FittedModel], number: int, naming: NamingSett
     numbers = after.model.sizes[-1] + len(after.model.terms[-1].effect.fitted_shape)
     price = 0.5 * numbers * math.log(len(after.residual)) + naming.separable
     return agreed_innovation_gain(before.residual, after.residual, after.recorded) > price
+
+
+def _unchecked_warnings(prepared: PreparedSimulation) -> list[str]:
+    """Return the simulation's warnings on parameters that no check before the search names."""
+    checks = [check for check in prepared.checks if check.kind != "at a bound"]
+    named = {f"`{name}`" for check in checks for name in check.parameters}
+    return [warning for warning in prepared.warnings if not any(name in warning for name in named)]
 
 
 def _impossible(whole: DiagnosisInputs) -> tuple[StartCheck, ...]:

@@ -604,9 +604,10 @@ class TestUndetermined:
         assert "direction 0.71 mass + 0.71 spring, relative" in warning
 
     @pytest.mark.e2e
-    def test_the_diagnosis_repeats_the_warning_once(self):
+    def test_the_diagnosis_lists_the_quotient_before_the_search_and_not_as_a_warning(self):
         diagnosis = diagnose(instance(Oscillator, step=0.02), self.recording, effects=(), surrogates=19)
-        assert sum("does not determine `mass` and `spring`" in warning for warning in diagnosis.warnings) == 1
+        assert [check.combination for check in diagnosis.checks if check.kind == "only together"] == ["mass / spring"]
+        assert not any("does not determine" in warning for warning in diagnosis.warnings)
 
     def test_a_parameter_without_influence_is_named(self):
         idle = instance(Oscillator, parameters={**Oscillator.parameters, "mass": 1.0, "colour": 5.0})
