@@ -67,7 +67,10 @@ class ImpossibleValue:
         ends = f"`{self.parameter}` ends at {size}"
         low, high = (f"{limit:.4g}" for limit in self.limits)
         if self.kind == "bound":
-            return f"{ends}, its bound: the recording needs a value beyond it, so the simulation lacks something."
+            return (
+                f"{ends}, its bound: the recording needs a value beyond it. A sign or unit is wrong, or the simulation "
+                "lacks something."
+            )
         if self.kind == "level":
             what = "a source" if self.acts > 0 else "a loss"
             recorded = f"{low} to {high} {self.unit}".rstrip()

@@ -253,6 +253,13 @@ def test_a_fit_far_from_its_initial_values_is_also_tried_from_there():
     torch.testing.assert_close(there.parameters, fit.model.prepared.start())
 
 
+def test_a_fit_at_a_bound_is_also_tried_from_the_nominal_values():
+    fit = start(DRAG, 0.0)
+    at_bound = replace(fit, parameters=torch.cat([torch.zeros_like(fit.parameters[:1]), fit.parameters[1:]]))
+    (there,) = at_other_values(at_bound, float("inf"))
+    assert float(there.parameters[0]) == 1.0
+
+
 def test_the_models_without_one_of_the_effects_are_known_afterwards():
     fit = start(DRAG, FRICTION)
     beam = beam_of(fit, cart_terms(fit, *NAMES))
