@@ -13,7 +13,7 @@ from mkc_torch._support.typesetting import plain, typeset
 from mkc_torch.cli.remarks import note_rows, warning_rows
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.diagnosis.verdict import Status
-from mkc_torch.report.diagnosis import environment, noise, numbers, unseen
+from mkc_torch.report.diagnosis import before_search, environment, noise, numbers, unseen, untested
 from mkc_torch.report.diagnosis import findings as sentences
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.evidence import rows
@@ -40,11 +40,16 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path], paths: top.R
     for notice in top.notices_first(d):
         console.print(Text(notice, style="bold yellow"))
     console.print(Text(top.headline(d), style=_STYLE[top.status(d)]))
+    if d.checks:
+        console.print(Text(before_search.TITLE, style="bold"))
+        console.print(_facts(("parameter", line) for line in before_search.check_lines(d)))
     console.print(_facts(_four_answers(d)))
     for i, finding in enumerate(d.findings, 1):
         if len(d.findings) > 1:
             console.print(Text(f"{i}  {_graded(finding)}", style="bold"))
         console.print(_facts(_of_finding(finding, d, first=i == 1)))
+    if d.too_few:
+        console.print(_facts(("candidate", untested.candidate_line(one)) for one in untested.strongest(d)))
     console.print(_facts(_of_all(d, console.width - _LABEL - 3)))
     # outside the table, so that a command or a long path is not broken and can be copied
     command = top.apply_command(d, paths)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -15,7 +15,7 @@ from mkc_torch.diagnosis.environment import GoodnessOfFit
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 _SLOWER = 1e-4
 """Share of an output's variation below which a noise floor estimated from samples is not meaningful."""
@@ -80,8 +80,9 @@ def goodness_of_fit(
     left = variation.clone() if lost or residual is None else size_of(residual)
     rounding = rounding_of(recorded)
     series = recorded if residual is None or lost else residual
-    estimated = _white_noise_scale(series) if floor is None else left.new_tensor(floor)
-    last = size_of(recorded[1:] - recorded[:-1])
+    seen = prepared.recorded
+    estimated = _each(_white_noise_scale, series, seen) if floor is None else left.new_tensor(floor)
+    last = _each(_steps, recorded, seen)
     last = last.square().mean().sqrt().expand_as(last) if _in_other_axes(prepared) else last
     units = units_of(prepared)
     found = []
@@ -129,6 +130,21 @@ def _middle(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
     reach = _FAR * robust_scale(values)
     reach = torch.where(reach > 0, reach, torch.inf)
     return centre + (values - centre).clamp(-reach, reach).mean(0)
+
+
+def _each(
+    scale: Callable[[Tensor], Tensor], values: Float[Tensor, "N m"], recorded: Bool[Tensor, "N m"] | None
+) -> Float[Tensor, " m"]:
+    """Return a scale of each column at its recorded samples, which follow one another."""
+    if recorded is None or recorded.shape != values.shape:
+        return scale(values)
+    columns = zip(values.unbind(-1), recorded.unbind(-1), strict=True)
+    return torch.cat([scale(column[used].unsqueeze(-1)) for column, used in columns])
+
+
+def _steps(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
+    """Return the size of the changes from sample to sample."""
+    return size_of(values[1:] - values[:-1])
 
 
 def _white_noise_scale(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:

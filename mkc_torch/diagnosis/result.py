@@ -43,6 +43,7 @@ from mkc_torch.diagnosis.suspected_sentences import suspected_sentences
 from mkc_torch.effects import words_of
 from mkc_torch.recording.disturbance import RejectedInterval
 from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.start_checks import StartCheck
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -104,14 +105,21 @@ class Stop:
         return f"Stopped {how}after {self.seconds:.0f} s: the search was not finished; not done: {left}."
 
 
-def notices(stop: Stop | None, *, quick: bool) -> tuple[str, ...]:
+_TOO_FEW = (
+    "The samples are too few for a test of missing physics: these are the fit, the residual and the strongest "
+    "candidates, without p-values. Record longer, or add runs; short runs in one file are counted together."
+)
+
+
+def notices(stop: Stop | None, *, quick: bool, too_few: bool = False) -> tuple[str, ...]:
     """Return the sentences.
 
     Example:
         >>> notices(Stop("time limit", 60.2, ("the search for effects",)), quick=False)
         ('Stopped after 60 s: the search was not finished; not done: the search for effects.',)
     """
-    return (*(() if stop is None else (str(stop),)), *((_QUICK,) if quick else ()))
+    left_out = (_TOO_FEW,) if too_few else (_QUICK,) if quick else ()
+    return (*(() if stop is None else (str(stop),)), *left_out)
 
 
 class CorrectingModel(nn.Module):
@@ -200,6 +208,8 @@ class Diagnosis:
         recordings: names of the recordings that were diagnosed together; empty for a single recording.
         quick: True for a quick look, which draws no surrogates: no p-values, and an unknown rate of false alarms.
         stop: why the search was stopped before its end, and what was not done; None if it was not stopped.
+        too_few: True if the samples are too few for a test; then candidates are ranked, and none is a finding.
+        checks: checks of the simulation's own parameters before the search.
         decisions: the models that were scored, and the decisions that findings, grades and verdict follow from.
 
     Example:
@@ -242,6 +252,8 @@ class Diagnosis:
     stop: Stop | None = None
     notes: tuple[str, ...] = ()
     decisions: Trail = field(default_factory=Trail)
+    checks: tuple[StartCheck, ...] = ()
+    too_few: bool = False
 
     def __repr__(self) -> str:
         found = ", ".join(finding.effect for finding in self.findings) or "nothing found"

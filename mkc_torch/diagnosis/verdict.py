@@ -42,6 +42,9 @@ UNFIT = "explained_share"
 EXPLAINS_MORE = "simulation_explains_more"
 """Rule that the simulation explains more of the outputs' variation than the correction by its findings."""
 
+TOO_FEW = "enough_samples"
+"""Rule that the samples suffice for a test."""
+
 _RESERVATIONS: Mapping[str, DiagnosisDoubt] = {"smaller_residual": "not_better", "few_rejected": "much_rejected"}
 """Doubt of each rule that leaves the verdict unchanged."""
 
@@ -103,11 +106,13 @@ class Remainder:
         lag: largest lag in samples at which the residual is correlated; 0 if it is white, or if the noise model
             includes its correlation.
         stop: why the search was stopped before its end.
+        few: number of samples, and the number that a test needs, if these are too few; otherwise None.
     """
 
     structure: tuple[str, ...] = ()
     lag: float = 0.0
     stop: Stop | None = None
+    few: tuple[int, int] | None = None
 
 
 def decisions_on_all(
@@ -128,6 +133,10 @@ def decisions_on_all(
 def _on_all(
     known: FitAssessment, left: Remainder, settings: EvidenceSettings, *, findings: bool, flexible: bool
 ) -> Iterator[Decision]:
+    if left.few is not None:
+        count, fewest = left.few
+        text = f"{count} samples are too few for a test of missing physics; it needs {fewest}."
+        yield _decision(TOO_FEW, count, fewest, passed=False, sentence=text)
     yield _explained_share(known, settings)
     if not findings:
         worst = min(known.follows, key=lambda fit: fit.explained, default=None)
@@ -335,6 +344,7 @@ def conclude(verdict: Verdict, grades: Sequence[Grade], failed: Mapping[str, str
         doubts.append("unconfirmed")
     doubts += [doubt for rule, doubt in _RESERVATIONS.items() if rule in failed]
     check = failed.get(EXPLAINS_MORE, "") if verdict == "unexplained" else ""
+    check = f"Record longer, or more runs: {failed[TOO_FEW]}" if TOO_FEW in failed else check
     return Conclusion(verdict, tuple(grades), tuple(doubts), "stopped" in failed, check)
 
 

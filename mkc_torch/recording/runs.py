@@ -22,7 +22,10 @@ _OVERLAP = 20
 """Fewest interleaved samples of each of two runs that make them separate wherever the second run starts."""
 
 _MANY = 0.05
-"""Largest share of backward steps; with more, the rows are unordered and contain no runs."""
+"""Largest share of backward steps; with more, the rows are unordered unless nearly every backward step begins a run."""
+
+_NEARLY_ALL = 0.9
+"""Share of the backward steps that begin a run, from which many backward steps are those of short runs."""
 
 
 def restarts(time: Float[np.ndarray, " N"]) -> list[int]:
@@ -40,13 +43,15 @@ def restarts(time: Float[np.ndarray, " N"]) -> list[int]:
         [20]
         >>> restarts(np.array([0.0, 2.0, 1.0, 4.0, 3.0]))
         []
+        >>> restarts(np.tile(np.arange(11.0), 6))
+        [11, 22, 33, 44, 55]
     """
     rows = np.flatnonzero(np.isfinite(time))
     t = time[rows]
     steps = np.diff(t)
     backward = np.flatnonzero(steps < 0) + 1
     forward = steps[steps > 0]
-    if len(backward) == 0 or len(forward) == 0 or len(backward) > max(_MANY * len(t), 3.0):
+    if len(backward) == 0 or len(forward) == 0:
         return []
     interval = float(np.median(forward))
     ends = np.append(backward[1:], len(t))
@@ -57,6 +62,8 @@ def restarts(time: Float[np.ndarray, " N"]) -> list[int]:
         if falls and _begins(t[start:i], t[i:end], interval):
             found.append(i)
             start = i
+    if len(backward) > max(_MANY * len(t), 3.0) and len(found) < _NEARLY_ALL * len(backward):
+        return []
     return [int(rows[i]) for i in found]
 
 

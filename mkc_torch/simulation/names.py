@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -22,3 +23,21 @@ class Names(SimpleNamespace):
         raise AttributeError(
             f"there is no `{name}` here; there is {known}. Names are those of `states`, `inputs`, `parameters`."
         )
+
+
+def watched(values: Mapping[str, Any]) -> tuple[Names, set[str]]:
+    """Return values as attributes, and a set to which each name is added when it is read.
+
+    Example:
+        >>> p, read = watched({"mass": 1.0, "drag": 0.1})
+        >>> p.mass, read
+        (1.0, {'mass'})
+    """
+    read: set[str] = set()
+
+    class Watched(Names):
+        def __getattribute__(self, name: str) -> Any:
+            read.update(values if name == "__dict__" else {name})
+            return super().__getattribute__(name)
+
+    return Watched(**values), read

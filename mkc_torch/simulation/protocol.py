@@ -17,6 +17,7 @@ from mkc_torch.simulation.dynamics.observer import Observer
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.own_offsets import OwnOffset
 from mkc_torch.simulation.ports import Answer, Changes, Nearby, Port
+from mkc_torch.simulation.start_checks import StartCheck
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -40,6 +41,8 @@ class ClosedForm(ABC):
     jacobian: Jacobian = "forward"
     observer: Observer | None = None
     dynamics: PreparedDynamics | None = None
+    recorded: Bool[Tensor, "N m"] | None = None
+    checks: tuple[StartCheck, ...] = ()
 
     @abstractmethod
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
@@ -95,6 +98,9 @@ class PreparedSimulation(Protocol):
         warnings: sentences about what the recording does not determine.
         state: constants that a :class:`Correction` needs in addition to the parameters; JSON-serialisable.
         measured: (N, k), the recorded columns that the residual is computed of.
+        recorded: (N, m), False where an output is missing and its residual is that of the nearest recorded sample; None
+            where none is missing.
+        checks: checks of the simulation's own parameters at the start of the fit.
         faults: sentences about faults of the recording with which no comparison is meaningful; usually empty.
         input_hold: "held", "linear" or "smooth" for each input that is used between samples.
         own_offsets: offsets of the outputs in single recordings, where several are diagnosed together.
@@ -130,6 +136,10 @@ class PreparedSimulation(Protocol):
     def state(self) -> Mapping[str, object]: ...
     @property
     def measured(self) -> Float[Tensor, "N k"]: ...
+    @property
+    def recorded(self) -> Bool[Tensor, "N m"] | None: ...
+    @property
+    def checks(self) -> tuple[StartCheck, ...]: ...
     @property
     def faults(self) -> tuple[str, ...]: ...
     @property

@@ -20,6 +20,7 @@ from mkc_torch.simulation.own_offsets import OwnOffset, determined_offsets
 from mkc_torch.simulation.parameter import Parameter, SimulationError, known_parameters
 from mkc_torch.simulation.ports import Changes, Nearby, Port, SignalSizes
 from mkc_torch.simulation.protocol import ClosedForm
+from mkc_torch.simulation.start_checks import Sensitivity, bound_checks, moved_inside, parameter_checks
 from mkc_torch.simulation.undetermined import undetermined
 
 if TYPE_CHECKING:
@@ -227,10 +228,18 @@ class PreparedStatic(ClosedForm):
         high = [parameter.upper for parameter in self.known.values()]
         self.bounds = self.time.new_tensor(low), self.time.new_tensor(high)
         self.independent = (True,) * len(self.channels)
+        self._start = [parameter.value for parameter in self.known.values()]
         self._refuse_not_finite()
         load_forward_mode()
-        tangents = torch.func.jacfwd(dual_constants(lambda theta: self.residual(theta, {})))(self.start())
+        given = list(self.known.values())
+        moved = moved_inside(given, lambda: self._sensitivity(self.start()))
+        self._start = [moved.get(number, parameter.value) for number, parameter in enumerate(given)]
+        at = self._sensitivity(self.start())
+        tangents = at.tangents
         self.warnings = undetermined(tangents.flatten(0, 1), self.start(), self.parameter_names)
+        names = list(self.parameter_names[: len(self.known) - len(own_offsets)])
+        checks = parameter_checks(at, names, lambda theta: self.residual(theta, {}), self._uses)
+        self.checks = (*checks, *bound_checks(self.parameter_names, given, moved))
         outputs = self._outputs(self.start(), {})
         constants = torch.ones_like(outputs)
         fixed, unscaled = (
@@ -241,7 +250,22 @@ class PreparedStatic(ClosedForm):
         self.ports = static_ports(system, units, self.unit, self.inputs, self.measured, fixed, unscaled)
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:
-        return self.time.new_tensor([parameter.value for parameter in self.known.values()])
+        return self.time.new_tensor(self._start)
+
+    def _sensitivity(self, theta: Float[Tensor, " p"]) -> Sensitivity:
+        tangents = torch.func.jacfwd(dual_constants(lambda values: self.residual(values, {})))(theta)
+        return Sensitivity(theta, torch.where(theta == 0, 1.0, theta.abs()), tangents, self.measured.std(0))
+
+    def _uses(self, number: int) -> bool:
+        """Whether an output depends on a parameter at these inputs, or at inputs of twice the size."""
+        other = self.start()
+        other[number] = 1.7 * other[number] + 0.1
+        own = len(other) - len(self.own_offsets)
+        for inputs in (self.inputs, 2.0 * self.inputs + 1.0):
+            outputs = [self.system.computed(self.time, inputs, theta[:own]) for theta in (self.start(), other)]
+            if not torch.equal(*outputs):
+                return True
+        return False
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
         return self.measured - changed_outputs(self._outputs(theta, changes), self.channels, changes)

@@ -265,14 +265,14 @@ def test_one_failing_recording_does_not_stop_the_other(tmp_path):
 
 @pytest.mark.e2e
 def test_runs_of_a_file_are_diagnosed_separately(tmp_path):
-    long, short = sensor_columns(QUIET), {name: values[:20] for name, values in sensor_columns(QUIET).items()}
+    long, short = sensor_columns(QUIET), {name: values[:5] for name, values in sensor_columns(QUIET).items()}
     columns = {name: torch.cat([long[name], short[name]]) for name in long}
     path = table(tmp_path / "a.csv", columns)
     text = path.read_text(encoding="utf-8").splitlines()
-    labels = ["run", *["flight/1"] * 500, *["2"] * 20]
+    labels = ["run", *["flight/1"] * 500, *["2"] * 5]
     path.write_text("\n".join(f"{a},{b}" for a, b in zip(text, labels, strict=True)), encoding="utf-8")
     result = diagnose_magnetometer(path, "--output", tmp_path / "out", "--run-column", "run")
-    assert_refused(result, f"{path}, run 2: 20 samples are too few", "1 of 2 recordings", lines=2)
+    assert_refused(result, f"{path}, run 2: 5 samples are too few", "1 of 2 recordings", lines=2)
     assert [p.name for p in (tmp_path / "out" / "a").iterdir()] == ["flight_1"]
     assert content_of(tmp_path / "out" / "a" / "flight_1")["recording"] == "a/flight/1"
 

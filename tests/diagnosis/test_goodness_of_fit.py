@@ -23,7 +23,9 @@ def randn(*size, seed=0):
 
 def prepared_stub(measured, channels=("angle",), unit="rad"):
     recording = SimpleNamespace(names=channels)
-    return SimpleNamespace(measured=measured, channels=channels, unit=unit, ports={}, recording=recording)
+    return SimpleNamespace(
+        measured=measured, channels=channels, unit=unit, ports={}, recording=recording, recorded=None
+    )
 
 
 def fit_of(measured, residual, declared=None, floor=None, **more):

@@ -181,9 +181,12 @@ def test_rejected_below_changes_the_gains(diagnosis_with_default_settings):
     )
 
 
-def test_a_recording_shorter_than_fewest_samples_raises():
-    with pytest.raises(ValueError, match="400 samples are too few for a diagnosis; it needs 500 at least"):
-        diagnosis(Settings(search=SearchSettings(fewest_samples=500)))
+def test_a_recording_shorter_than_fewest_samples_is_not_tested():
+    result = diagnosis(Settings(search=SearchSettings(fewest_samples=500)))
+    assert result.too_few
+    assert result.findings == ()
+    assert result.p_value is None
+    assert result.candidates
 
 
 def test_a_column_below_fewest_finite_is_left_out():

@@ -331,6 +331,9 @@ STEADY = np.arange(0.0, 50.0, 0.5)
         (np.where(np.arange(100) == 50, STEADY - 0.7, STEADY), []),  # a single sample that steps back
         (np.random.default_rng(0).permutation(STEADY), []),  # rows in no order
         (np.concatenate([STEADY[:99], [np.nan], STEADY]), [100]),
+        (np.tile(np.arange(11.0), 6), [11, 22, 33, 44, 55]),  # short runs, in more than a twentieth of the rows
+        (np.concatenate([np.arange(4.0), np.arange(7.0), np.arange(3.0)]), [4, 11]),
+        (np.random.default_rng(1).permutation(np.tile(np.arange(11.0), 6)), []),
         (STEADY[::-1], []),
         (np.zeros(5), []),
         (np.array([np.nan, np.nan]), []),

@@ -117,7 +117,9 @@ class EvidenceContext:
     def inliers(self) -> Bool[Tensor, "N m"]:
         """The inliers of both the final fit and the model on held-out blocks."""
         last, settings = self.held_out[-1], self.settings.evidence
-        return (last.residual.abs() <= settings.inlier * last.d) & (self.final.fit.weights > settings.believed)
+        near = last.residual.abs() <= settings.inlier * last.d
+        near = near if self.prepared.recorded is None else near & self.prepared.recorded
+        return near & (self.final.fit.weights > settings.believed)
 
     def rms(self, model: Evidence) -> float:
         """Return the RMSE of a model on held-out blocks, over the inliers."""
@@ -150,6 +152,6 @@ def gain_of(final: FinalEstimate, number: int) -> Float[Tensor, " N"]:
     fit = final.fit
     model, parameters = fit.model, fit.parameters.clone()
     start = model.base + sum(model.sizes[:number])
-    with_it = scored(model.residual(parameters), fit.sigma, fit.d, fit.bound)
+    with_it = scored(model.residual(parameters), fit.sigma, fit.d, fit.bound, fit.recorded)
     parameters[start : start + model.sizes[number]] = 0.0
-    return (with_it - scored(model.residual(parameters), fit.sigma, fit.d, fit.bound)).detach()
+    return (with_it - scored(model.residual(parameters), fit.sigma, fit.d, fit.bound, fit.recorded)).detach()

@@ -108,25 +108,28 @@ def held_out(
         return found.residual, found.sigma, found.d, found.bound, found.parameters
 
     folds = run_parallel([partial(without, train) for train in blocks.train], fit.model.prepared, thing="part held out")
-    for number, (out, *density, _) in enumerate(folds):
+    for number, (out, sigma, d, bound, _) in enumerate(folds):
         seen = blocks.fold == number
         residual[seen] = out[seen]
-        log_likelihood[seen] = scored(out, *density)[seen]
-    _, sigma, d, _, parameters = zip(*folds, strict=True)
-    middle = torch.stack(sigma).median(0).values, torch.stack(d).median(0).values
+        log_likelihood[seen] = scored(out, sigma, d, bound, fit.recorded)[seen]
+    _, sigmas, scales, _, parameters = zip(*folds, strict=True)
+    middle = torch.stack(sigmas).median(0).values, torch.stack(scales).median(0).values
     left_out = 1.0 - float(torch.stack(blocks.train).double().mean())
     return Evidence(log_likelihood, residual, *middle, torch.stack(parameters), left_out)
 
 
 def on_all(fit: FittedModel) -> Evidence:
     """Score a fit on its training samples, in place of held-out blocks."""
-    log_likelihood = scored(fit.residual, fit.sigma, fit.d, fit.bound)
+    log_likelihood = scored(fit.residual, fit.sigma, fit.d, fit.bound, fit.recorded)
     return Evidence(log_likelihood, fit.residual, fit.sigma, fit.d, fit.parameters.unsqueeze(0), 0.5)
 
 
-def scored(residual: Tensor, sigma: Tensor, d: Tensor, bound: Tensor) -> Float[Tensor, " N"]:
-    """Return the log-likelihood of each sample, summed over channels."""
-    return -mkc_nll(residual, sigma, d, bound).sum(-1)
+def scored(
+    residual: Tensor, sigma: Tensor, d: Tensor, bound: Tensor, recorded: Bool[Tensor, "N m"] | None = None
+) -> Float[Tensor, " N"]:
+    """Return the log-likelihood of each sample, summed over the channels that are recorded there."""
+    lost = mkc_nll(residual, sigma, d, bound)
+    return -(lost if recorded is None else recorded * lost).sum(-1)
 
 
 _DRAWS = 2000

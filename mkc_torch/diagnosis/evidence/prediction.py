@@ -207,7 +207,7 @@ def _reach(term: Term) -> Tensor | None:
 
 def _score(fit: FittedModel, rows: Tensor) -> Tensor:
     found = fitted(fit.model, fit.parameters, fit.bound, rows=rows.to(fit.residual.dtype), graduate=False)
-    return scored(found.residual, found.sigma, found.d, found.bound)
+    return scored(found.residual, found.sigma, found.d, found.bound, found.recorded)
 
 
 @dataclass(frozen=True)

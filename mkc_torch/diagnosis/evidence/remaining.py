@@ -80,9 +80,10 @@ def ceiling(model: JointModel, fit: FittedModel, drivers: Sequence[Driver], bloc
     parameters = fit.parameters[: model.size]
     residual = model.residual(parameters).detach()
     curves = curves_of(drivers, len(residual))
-    smooth = smooth_tangents(model, parameters, curves, fit.weights / fit.d.square(), blocks)
+    weights = fit.weights if fit.recorded is None else fit.recorded * fit.weights
+    smooth = smooth_tangents(model, parameters, curves, weights / fit.d.square(), blocks)
     problem = _problem(model, parameters, residual, smooth, fit.d)
-    paths = _paths(problem, smooth, fit.weights, blocks)
+    paths = _paths(problem, smooth, weights, blocks)
     chosen = _chosen(paths)
     taken = [{smooth.names[k] for k in step.groups} for step in chosen]
     common = [name for name in curves if name != TIME and 2 * sum(name in names for names in taken) > len(taken)]
@@ -236,6 +237,7 @@ def _judged(problem: _Problem, chosen: Sequence[_Step], fit: FittedModel, blocks
     """Reweight each fit by its density, on the common domain, and score it on its held-out fold."""
     residual, bound = problem.residual, fit.bound / fit.d
     used = torch.stack(blocks.train).unsqueeze(-1).to(residual)
+    used = used if fit.recorded is None else used * fit.recorded
     columns = [problem.tangents[:, step.index] for step in chosen]
     left = torch.stack([_moved(residual, c, s.delta) for c, s in zip(columns, chosen, strict=True)])
     sigma, d = fit.sigma.expand(len(chosen), -1), torch.ones_like(left[:, 0])
@@ -248,7 +250,7 @@ def _judged(problem: _Problem, chosen: Sequence[_Step], fit: FittedModel, blocks
         density = fit_density(left, bound=room, weight=weight, tol=1e-6)
         sigma, d = density.sigma, density.d
     score = torch.stack(
-        [scored(e, s, size * fit.d, fit.bound) for e, s, size in zip(left * fit.d, sigma, d, strict=True)]
+        [scored(e, s, size * fit.d, fit.bound, fit.recorded) for e, s, size in zip(left * fit.d, sigma, d, strict=True)]
     )
     own = blocks.fold.unsqueeze(0)
     return Evidence(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.first_fit import multiple_shooting_start
+from mkc_torch.simulation.dynamics.impossible import at_bounds
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 if TYPE_CHECKING:
@@ -29,9 +30,6 @@ _NOUGHT = 1e-3
 
 _AWAY = 30.0
 """Relative value above which a parameter has diverged."""
-
-_AT_END = 1e-6
-"""Relative distance within which a parameter is at a bound."""
 
 _FIXES = 0.5
 """Relative residual below which a trial is reported as the reason."""
@@ -57,16 +55,7 @@ def at_ends(fit: FittedModel) -> tuple[str, ...]:
     prepared = fit.model.prepared.dynamics
     if prepared is None:
         return ()
-    found = []
-    for number, (name, known) in enumerate(prepared.known.items()):
-        value = float(fit.parameters[number])
-        size = max(abs(known.value), 1e-300)
-        low, high = (float(bound[number]) for bound in prepared.bounds)
-        at_low = value - low <= _AT_END * size and known.value - low > _NOUGHT * size
-        at_high = high - value <= _AT_END * size and high - known.value > _NOUGHT * size
-        if at_low or at_high:
-            found.append(name)
-    return tuple(found)
+    return tuple(dict.fromkeys(name for name, _ in at_bounds(prepared, fit.parameters)))
 
 
 def reasons_of(fits: Sequence[FittedModel], follows: Sequence[GoodnessOfFit]) -> tuple[str, ...]:
@@ -164,14 +153,15 @@ def _trials(prepared: PreparedDynamics) -> list[_Trial]:
 
     if bool(torch.cat(prepared.bounds).isfinite().any()):
         trials.append(_Trial(of_signs, freed, thorough=True))
+    known = prepared.known_inputs.inputs
     for number, name in enumerate(prepared.system.inputs):
-        turned = prepared.inputs_at_rows.clone()
+        turned = known.clone()
         turned[:, number] = -turned[:, number]
         trials.append(_Trial(_always(f"With the sign of `{name}` reversed,"), _with_inputs(prepared, turned)))
-        step = float(prepared.time.diff().median())
-        for lag in (lag for lag in LAGS if lag < len(prepared.time) // 10):
-            late = prepared.inputs_at_rows.clone()
-            late[lag:, number] = prepared.inputs_at_rows[:-lag, number]
+        step = float(prepared.known_inputs.time.diff().median())
+        for lag in (lag for lag in LAGS if lag < len(known) // 10):
+            late = known.clone()
+            late[lag:, number] = known[:-lag, number]
             text = f"With `{name}` delayed by {lag * step:.3g} s,"
             trials.append(_Trial(_always(text), _with_inputs(prepared, late)))
     return trials
@@ -181,15 +171,16 @@ def _always(text: str) -> Callable[[Tensor], str]:
     return lambda _: text
 
 
-def _still(prepared: PreparedDynamics, number: int) -> Float[Tensor, "N u"]:
-    inputs = prepared.inputs_at_rows.clone()
+def _still(prepared: PreparedDynamics, number: int) -> Float[Tensor, "R u"]:
+    inputs = prepared.known_inputs.inputs.clone()
     inputs[:, number] = inputs[:, number].mean()
     return inputs
 
 
-def _with_inputs(prepared: PreparedDynamics, inputs: Float[Tensor, "N u"]) -> PreparedDynamics:
+def _with_inputs(prepared: PreparedDynamics, inputs: Float[Tensor, "R u"]) -> PreparedDynamics:
     other = copy.copy(prepared)
-    other.inputs_at_rows = inputs
+    other.known_inputs = replace(prepared.known_inputs, inputs=inputs)
+    other.inputs_at_rows = inputs[prepared.known_inputs.samples]
     return other.with_input_hold({})
 
 

@@ -95,7 +95,8 @@ def attributed(fit: FittedModel, number: int) -> Attribution | None:
         there = model.signals(parameters)[term.port]
 
         def likelihood(change: Tensor, parameters: Tensor = parameters, model: JointModel = model) -> Tensor:
-            return scored(model.residual_with_change(parameters, term.port, change), fit.sigma, fit.d, fit.bound).sum()
+            residual = model.residual_with_change(parameters, term.port, change)
+            return scored(residual, fit.sigma, fit.d, fit.bound, fit.recorded).sum()
 
         slope = vector_jacobian_product(likelihood, there.new_zeros(len(there), width), there.new_ones(()))
         added = term.effect.change(gamma, term.shape, term.context(prepared, there))[:, :width]

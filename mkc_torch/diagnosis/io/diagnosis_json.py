@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.decisions import Trail
 from mkc_torch.diagnosis.environment import DisturbanceEstimate, NoiseEnvironment, ProcessNoise, ShapeCheck
+from mkc_torch.diagnosis.io.checks_json import checks_json
 from mkc_torch.diagnosis.result import (
     Diagnosis,
     EffectParameter,
@@ -206,6 +207,7 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "verdict": d.verdict,
         "doubts": conclusion(d).doubts,
         "goodness_of_fit": goodness_of_fit_json(d.environment),
+        "before_the_search": [checks_json(check) for check in d.checks],
         "reasons": d.environment.reasons,
         **recordings_json(d.environment),
         "noise": _noise(d.noise) | noise_json(d.environment),

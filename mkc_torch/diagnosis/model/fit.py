@@ -15,11 +15,13 @@ from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.noise.outliers import pseudo_residual
 from mkc_torch.diagnosis.settings import NoiseSettings
+from mkc_torch.functional import mkc_nll
+from mkc_torch.simulation.dynamics.missing import recorded_weight
 from mkc_torch.simulation.dynamics.other_starts import OtherStarts
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 
 _CLIP = 2.0
@@ -84,7 +86,16 @@ class FittedModel:
 
     def pseudo(self, settings: NoiseSettings) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
         """Return the pseudo-residual and its mask, (N, m) each."""
-        return pseudo_residual(self.residual, self.sigma, self.d, settings.rejected_below)
+        values, counts = pseudo_residual(self.residual, self.sigma, self.d, settings.rejected_below)
+        if self.recorded is None:
+            return values, counts
+        recorded = self.recorded.to(counts.dtype)
+        return values * recorded, counts * recorded
+
+    @property
+    def recorded(self) -> Bool[Tensor, "N m"] | None:
+        """Mask of the recorded outputs; None where none is missing."""
+        return self.model.prepared.recorded
 
     @cached_property
     def open_loop(self) -> FittedModel | None:
@@ -161,12 +172,13 @@ def _fit(
     graduate: bool,
     effort: Effort = FULL,
 ) -> FittedModel:
-    way = model.continuation()
+    way, recorded = model.continuation(), model.prepared.recorded
+    weight = rows if recorded is None else recorded_weight(recorded, rows).to(start)
     found = nonlinear.fit(
         way,
         start,
         bound=bound,
-        weight=rows,
+        weight=weight,
         prior=model.prior,
         lower=None if model.bounds is None else model.bounds[0],
         upper=None if model.bounds is None else model.bounds[1],
@@ -188,9 +200,18 @@ def _fit(
         found.bound,
         residual,
         found.weights,
-        float(found.log_likelihood) * len(model.prepared.time),
+        _total_log_likelihood(found, residual, weight if recorded is not None else None),
         bool(found.converged),
     )
+
+
+def _total_log_likelihood(
+    found: nonlinear.NonlinearFit, residual: Float[Tensor, "N m"], weight: Float[Tensor, "N m"] | None
+) -> float:
+    """Return the log-likelihood of all samples; with missing outputs, of the weighted recorded ones."""
+    if weight is None:
+        return float(found.log_likelihood) * len(residual)
+    return -float((weight * mkc_nll(residual, found.sigma, found.d, found.bound)).sum())
 
 
 def fitted_with_effect(
@@ -239,15 +260,18 @@ def _finite_start(
     return model, start
 
 
-def clipped_residual(residual: Float[Tensor, "N m"]) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
-    """Return the pseudo-residual of Huber's score at two robust scales, and its mask: no sample is rejected.
+def clipped_residual(
+    residual: Float[Tensor, "N m"], recorded: Bool[Tensor, "N m"] | None = None
+) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
+    """Return the pseudo-residual of Huber's score at two robust scales, and its mask: no recorded sample is rejected.
 
     Huber, "Robust Statistics" (1981), 7.6.
     """
+    mask = torch.ones_like(residual) if recorded is None else recorded.to(residual.dtype)
     scale = robust_scale(residual)
     z = residual / scale.clamp(min=1e-300)
     slope = (z.abs() < _CLIP).to(z.dtype).mean(0).clamp(min=0.2)
-    return scale * z.clamp(-_CLIP, _CLIP) / slope, torch.ones_like(residual)
+    return mask * scale * z.clamp(-_CLIP, _CLIP) / slope, mask
 
 
 def no_first_fit(prepared: PreparedSimulation, others: OtherStarts | None = None) -> str:

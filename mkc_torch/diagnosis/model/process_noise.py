@@ -258,7 +258,9 @@ def with_noise_around(fit: FittedModel, declared: Mapping[str, float], settings:
     residual = model.residual(fit.parameters).detach()
     if not bool(residual.isfinite().all()):
         return fit
-    density = fit_density(residual, bound=fit.bound)
+    recorded = None if fit.recorded is None else fit.recorded.to(residual)
+    density = fit_density(residual, bound=fit.bound, weight=recorded)
+    samples = len(residual) if recorded is None else recorded.sum(0)
     return replace(
         fit,
         model=model,
@@ -266,7 +268,7 @@ def with_noise_around(fit: FittedModel, declared: Mapping[str, float], settings:
         d=density.d,
         residual=residual,
         weights=torch.exp(-0.5 * (residual / (density.d * density.sigma)).square()),
-        log_likelihood=float(density.log_likelihood.sum()) * len(residual),
+        log_likelihood=float((density.log_likelihood * samples).sum()),
     )
 
 

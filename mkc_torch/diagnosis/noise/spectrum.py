@@ -13,7 +13,7 @@ from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.diagnosis.noise.outliers import running_median
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
 
 
 MAX_ORDER = 12
@@ -309,12 +309,17 @@ def _levinson(covariance: Float[Tensor, "lags B"], N: int) -> Float[Tensor, "ord
     return best
 
 
-def innovation_gain(before: Float[Tensor, "N m"], after: Float[Tensor, "N m"]) -> float:
+def innovation_gain(
+    before: Float[Tensor, "N m"], after: Float[Tensor, "N m"], recorded: Bool[Tensor, "N m"] | None = None
+) -> float:
     """Return the log-likelihood gain of ``after`` over ``before`` in nats.
 
     Both residuals, clipped around their running medians, are filtered by the autoregression of ``after``. The
     innovations are compared by squares clipped at three scales (Hampel et al., "Robust Statistics", 1986, 2.6).
     """
+    if recorded is not None and before.shape == recorded.shape:  # each output at its own samples
+        columns = zip(before.unbind(-1), after.unbind(-1), recorded.unbind(-1), strict=True)
+        return sum(innovation_gain(b[used].unsqueeze(-1), a[used].unsqueeze(-1)) for b, a, used in columns)
     courses = [running_median(residual, min(_NEAR, len(residual) - 1)) for residual in (before, after)]
     reach = _CLIPPED * robust_scale(after - courses[1])
     tame = [
@@ -330,7 +335,9 @@ def innovation_gain(before: Float[Tensor, "N m"], after: Float[Tensor, "N m"]) -
     return total
 
 
-def agreed_innovation_gain(first: Float[Tensor, "N m"], other: Float[Tensor, "N m"]) -> float:
+def agreed_innovation_gain(
+    first: Float[Tensor, "N m"], other: Float[Tensor, "N m"], recorded: Bool[Tensor, "N m"] | None = None
+) -> float:
     """Return the smaller gain of ``other`` over ``first`` in nats, over the noise models of both residuals.
 
     Negative if it loses under both, 0 if the two disagree.
@@ -342,7 +349,7 @@ def agreed_innovation_gain(first: Float[Tensor, "N m"], other: Float[Tensor, "N 
         >>> agreed_innovation_gain(noise + decay, noise) > 10.0 > -10.0 > agreed_innovation_gain(noise, noise + decay)
         True
     """
-    gains = innovation_gain(first, other), -innovation_gain(other, first)
+    gains = innovation_gain(first, other, recorded), -innovation_gain(other, first, recorded)
     return max(min(gains), 0.0) + min(max(gains), 0.0)
 
 

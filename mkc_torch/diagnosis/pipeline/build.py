@@ -45,8 +45,10 @@ from mkc_torch.diagnosis.verdict import (
 )
 from mkc_torch.diagnosis.vetoes import VetoContext, decisions_on, grade, is_dropped
 from mkc_torch.recording.unit_warnings import unit_warnings
+from mkc_torch.simulation.dynamics.impossible import impossible_checks, impossible_values
 from mkc_torch.simulation.dynamics.noise import sized_noise
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
+from mkc_torch.simulation.start_checks import StartCheck
 
 
 def assess_baseline(base: ProcessNoiseFit, declared: Mapping[str, float]) -> tuple[GoodnessOfFit, ...]:
@@ -177,10 +179,10 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
         corrected=case.spread(case.held_out[-1]),
         advice=(),
         warnings=(
-            *notices(whole.stop, quick=options.quick),
+            *notices(whole.stop, quick=options.quick, too_few=options.too_few),
             *prepared.recording.warnings,
             *unit_warnings(prepared.recording),
-            *prepared.warnings,
+            *_unchecked_warnings(prepared),
             *warnings_of(whole.drivers.warnings),
             *_time_warnings(prepared),
             *evidence_warnings(answers),
@@ -192,16 +194,19 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
         separability=separability(first) if first else _nothing_to_separate(),
         traces=_traces(prepared, whole.drivers, case.base, final),
         model=model_of(final, whole.simulation),
+        checks=(*prepared.checks, *_impossible(whole)),
         evidence=answers.of_all,
         environment=_environment(whole, known, unfit=unfit),
         quick=options.quick,
         stop=whole.stop,
+        too_few=options.too_few,
     )
     left = Remainder(
         tuple(_structure(diagnosis, whole, first, final)),
         # for differential equations the noise model includes the correlation already
         0.0 if known.noise is not None else _lag(diagnosis),
         whole.stop,
+        (len(prepared.time), options.settings.search.fewest_samples) if options.too_few else None,
     )
     decided = (
         *(decision for _, decisions in graded for decision in decisions),
@@ -288,7 +293,23 @@ def _clearly_better(fits: Sequence[FittedModel], number: int, naming: NamingSett
     before, after = fits[number], fits[number + 1]
     numbers = after.model.sizes[-1] + len(after.model.terms[-1].effect.fitted_shape)
     price = 0.5 * numbers * math.log(len(after.residual)) + naming.separable
-    return agreed_innovation_gain(before.residual, after.residual) > price
+    return agreed_innovation_gain(before.residual, after.residual, after.recorded) > price
+
+
+def _unchecked_warnings(prepared: PreparedSimulation) -> list[str]:
+    """Return the simulation's warnings on parameters that no check before the search names."""
+    checks = [check for check in prepared.checks if check.kind != "at a bound"]
+    named = {f"`{name}`" for check in checks for name in check.parameters}
+    return [warning for warning in prepared.warnings if not any(name in warning for name in named)]
+
+
+def _impossible(whole: DiagnosisInputs) -> tuple[StartCheck, ...]:
+    """Return the values of the fit without effects that cannot be."""
+    fit = whole.base.fit if whole.base.free is None else whole.base.free
+    prepared = fit.model.prepared.dynamics
+    if prepared is None:
+        return ()
+    return impossible_checks(prepared, impossible_values(prepared, fit.parameters))
 
 
 def _assessment(whole: DiagnosisInputs) -> FitAssessment:

@@ -18,12 +18,16 @@ from mkc_torch.recording.join_recordings import join_recordings, recording_names
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
+_FREE_SAMPLES = 6
+"""Samples of a fit in addition to one for each parameter, at least, so that a residual has a size. Judgement."""
+
 
 @dataclass(frozen=True)
 class SearchOptions:
     """The options of :func:`diagnose`.
 
-    ``judged`` is True if held-out blocks test the candidates; ``suspect`` holds the suspected sets of effects as texts.
+    ``judged`` is True if held-out blocks test the candidates; ``suspect`` holds the suspected sets of effects as texts;
+    ``too_few`` is True if the samples are too few for any test, so that candidates are only ranked.
     """
 
     level: float
@@ -36,6 +40,7 @@ class SearchOptions:
     quick: bool = False
     judged: bool = True
     suspect: tuple[str, ...] = ()
+    too_few: bool = False
 
 
 @dataclass(frozen=True)
@@ -87,11 +92,12 @@ def prepare(
     check_limits(options.quick, time_limit)
     refuse_no_settings(options.settings)
     _refuse_no_progress(progress)
-    settings = quick_settings(options.settings) if options.quick else options.settings
-    _refuse_few(len(recording), "samples", recording, settings)
     progress("reading the recording")
     prepared = simulation.prepare(recording)
-    _refuse_few(len(prepared.time), "usable samples", recording, settings)
+    _refuse_few(prepared)
+    if len(prepared.time) < options.settings.search.fewest_samples:
+        options = replace(options, quick=True, max_findings=0, suspect=(), too_few=True)
+    settings = quick_settings(options.settings) if options.quick else options.settings
     _refuse_constant(prepared)
     prepared = with_own_offsets(prepared, several)
     options = replace(
@@ -110,7 +116,7 @@ def prepare(
 
 
 def _unjudged(options: SearchOptions, prepared: PreparedSimulation) -> bool:
-    return options.quick and prepared.dynamics is not None
+    return options.too_few or (options.quick and prepared.dynamics is not None)
 
 
 def subject_of(recording: Recording) -> str:
@@ -118,12 +124,14 @@ def subject_of(recording: Recording) -> str:
     return f"{recording.name}: " if recording.name else ""
 
 
-def _refuse_few(count: int, what: str, recording: Recording, settings: Settings) -> None:
-    fewest = settings.search.fewest_samples
+def _refuse_few(prepared: PreparedSimulation) -> None:
+    """Raise for fewer samples than a fit of the simulation and an estimate of its noise need."""
+    count, fewest = len(prepared.time), len(prepared.parameter_names) + _FREE_SAMPLES
     if count < fewest:
-        advice = " Record longer." if what == "samples" else ""
         raise ValueError(
-            f"{subject_of(recording)}{count} {what} are too few for a diagnosis; it needs {fewest} at least.{advice}"
+            f"{subject_of(prepared.recording)}{count} usable samples are too few for a fit of "
+            f"{len(prepared.parameter_names)} parameters and initial states; it needs {fewest} at least. Record "
+            "longer, or fix parameters."
         )
 
 

@@ -61,7 +61,8 @@ def simplified(
             continue
         after = held_out(other, blocks)
         lost = float((evidence.log_likelihood - after.log_likelihood).sum())
-        as_well = lost <= settings.separable or agreed_innovation_gain(after.residual, evidence.residual) <= 0.0
+        gain = agreed_innovation_gain(after.residual, evidence.residual, fit.recorded)
+        as_well = lost <= settings.separable or gain <= 0.0
         if as_well and holds(other, after):
             fit, evidence = other, after
     return fit, evidence

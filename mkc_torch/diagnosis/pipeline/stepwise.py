@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.evidence.held_out import (
     blocks_of,
     gain_interval,
     held_out,
+    on_all,
 )
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
@@ -55,7 +56,7 @@ def _holds(
     if first:
         plain = located.beyond > settings.beyond_doubt and high > 0.0
         price = 0.5 * located.fit.model.sizes[-1] * math.log(len(after.log_likelihood))
-        return gain > 0.0 or plain or innovation_gain(before.residual, after.residual) > price
+        return gain > 0.0 or plain or innovation_gain(before.residual, after.residual, located.fit.recorded) > price
     return low > 0.0 or (gain > 0.0 and located.beyond > settings.further)
 
 
@@ -84,7 +85,7 @@ def first_step(
     if terms:
         first = _located(base, terms, options, generator, keep=lambda first: keep(replace(so_far, first=first)))
     keep(replace(so_far, first=first))
-    evidence = held_out(base, blocks)
+    evidence = held_out(base, blocks) if options.judged else on_all(base)
     first_step = StepwiseSearch(first, (), None, blocks, (evidence,), terms)
     keep(first_step)
     if first is None:

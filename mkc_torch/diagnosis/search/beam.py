@@ -23,7 +23,7 @@ from mkc_torch.diagnosis.score import ScoreBasis, is_implausible, score
 from mkc_torch.diagnosis.search.candidate import Candidate, ModelKey, in_order, model_key
 from mkc_torch.diagnosis.search.move_fits import (
     POLISHED,
-    at_initial_values,
+    at_other_values,
     fitted_exchanged,
     fitted_held,
     fitted_reordered,
@@ -239,13 +239,13 @@ class BeamSearch:
     ) -> dict[Key, list[Callable[[], FittedModel | None]]]:
         """Return fits of each effect from elsewhere than the simulation alone in open loop.
 
-        From its initial values, if the fit went far from them; and through the process noise of the simulation alone,
-        along whose trajectory a strong effect can be fitted that the open loop does not reach. The latter is slow, and
-        is for the candidates that the screening found there.
+        From its initial values, if the fit went far from them or to values that cannot be; and through the process
+        noise of the simulation alone, along whose trajectory a strong effect can be fitted that the open loop does not
+        reach. The latter is slow, and is for the candidates that the screening found there.
         """
         found: dict[Key, list[Callable[[], FittedModel | None]]] = {}
-        there, noisy = at_initial_values(fit, self.settings.search.ran_away), self.noisy
-        if there is not None:
+        noisy = self.noisy
+        for there in at_other_values(fit, self.settings.search.ran_away):
             for addition in additions(there, terms, self.settings.noise):
                 for term, size in addition.starts[:POLISHED]:
                     start = torch.cat([there.parameters, size])

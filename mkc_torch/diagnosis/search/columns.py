@@ -159,7 +159,7 @@ def _fit_from(changed: PreparedDynamics, start: torch.Tensor) -> FittedModel | N
 
 def _changed(prepared: PreparedDynamics, change: ColumnChange) -> PreparedDynamics:
     """Return the simulation prepared with a changed column."""
-    known = prepared.recording
+    known = prepared.whole
     columns = {name: change.factor * known[name] if name == change.column else known[name] for name in known.names}
     recording = Recording(columns, name=known.name, units=known.units, labels=known.labels)
     return PreparedDynamics(prepared.system, recording, prepared.channels).with_input_hold(prepared.input_hold)

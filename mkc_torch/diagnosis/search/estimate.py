@@ -90,7 +90,8 @@ def drift_residuals(
         values, counts = fit.pseudo(settings)
         return Local(values, counts, linearise(model, parameters, values, counts, tangents.bare), None)
     # a burst must not bias the first course
-    counts = near_median(fit.residual, len(fit.residual) // _MEDIANS, settings)
+    recorded = torch.ones_like(fit.residual) if fit.recorded is None else fit.recorded.to(fit.residual)
+    counts = recorded * near_median(fit.residual, len(fit.residual) // _MEDIANS, settings)
     values = counts * fit.residual
     noise = linearise(model, parameters, values, counts, tangents.bare, white=True)
     family = noise.search.noise_fit(noise.series).family
@@ -107,6 +108,7 @@ def drift_residuals(
         near = rejected_in_all(alone * without_one_sided(quick, counts * alone, settings), settings)
         if float(near.mean()) < 1.0 - settings.bursts:
             near = alone
+        near = recorded * near
         values, counts = values * near, counts * near
         values = values + counts * course
         if number > 0 and float((counts != before).double().mean()) < _SETTLED:
@@ -196,7 +198,7 @@ def estimate(fit: FittedModel, settings: NoiseSettings) -> FinalEstimate:
         residual, nearby = model.answer(parameters)
         # the simulation may have no finite trajectory there, or the step be beyond the linear range
         finite = bool(residual.isfinite().all())
-        if finite and agreed_innovation_gain(fit.residual, residual.detach()) > -len(parameters):
+        if finite and agreed_innovation_gain(fit.residual, residual.detach(), fit.recorded) > -len(parameters):
             moved = model if nearby is None else model.begun_with(nearby.bare)
             fit, covariance = replace(fit, model=moved, parameters=parameters, residual=residual.detach()), taken
     noise = found.search.noise_fit(found.series)

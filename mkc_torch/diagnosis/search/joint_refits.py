@@ -51,7 +51,7 @@ def strongest(
     tangents = tangents_of(base.model, around, noise, terms)
     looks = [
         ((around, base.pseudo(noise)), search.refitted),
-        ((around, clipped_residual(base.residual)), search.refitted_elsewhere),
+        ((around, clipped_residual(base.residual, base.recorded)), search.refitted_elsewhere),
     ]
     works = [partial(_short_list, base, terms, start, tangents, most) for start, most in looks]
     lists = run_parallel(works, base.model.prepared, terms)
@@ -129,7 +129,7 @@ def _part_fits(base: FittedModel, parts: int) -> list[Callable[[], _Part | None]
             return None
         parameters = torch.cat([theta, base.parameters[base.model.base :]])
         residual = base.model.residual(parameters)
-        return _Part((parameters, clipped_residual(residual)), robust_scale(residual[rows]))
+        return _Part((parameters, clipped_residual(residual, base.recorded)), robust_scale(residual[rows]))
 
     part = torch.arange(N) * parts // N
     return [partial(fit_to, part == number) for number in range(parts)]

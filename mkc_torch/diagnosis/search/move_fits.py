@@ -22,6 +22,7 @@ from mkc_torch.diagnosis.model.simpler import simpler_start
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.moves import Addition, at_size_zero
 from mkc_torch.nonlinear import NoFitError
+from mkc_torch.simulation.dynamics.impossible import impossible_values
 
 POLISHED = 2
 """Rough fits of an effect that are refined to the end."""
@@ -31,10 +32,11 @@ def most_likely(fits: Sequence[FittedModel]) -> FittedModel:
     return max(fits, key=lambda fit: fit.log_likelihood)
 
 
-def at_initial_values(fit: FittedModel, away: float) -> FittedModel | None:
-    """Return a fit moved to the initial values of its parameters; None if it stayed near them.
+def at_other_values(fit: FittedModel, away: float) -> list[FittedModel]:
+    """Return a fit moved to the initial values of its parameters, and to the user's, where it must not stay.
 
-    A missing effect can drive a parameter to where no effect helps.
+    A missing effect can drive a parameter to where no effect helps: far from its initial value, or to a value that
+    cannot be.
 
     Args:
         fit: of the simulation alone.
@@ -43,12 +45,20 @@ def at_initial_values(fit: FittedModel, away: float) -> FittedModel | None:
     prepared = fit.model.prepared
     theta, own = prepared.start(), fit.model.base - prepared.beginnings
     sizes = torch.stack([theta[:own], fit.parameters[:own]]).abs()
-    if not bool((sizes.amax(0) > away * sizes.amin(0)).any()):
-        return None
-    residual = fit.model.residual(theta)
-    # a clipped residual: at values that are not fitted any sample may be far
-    value, _ = clipped_residual(residual)
-    return replace(fit, parameters=theta, residual=value) if bool(residual.isfinite().all()) else None
+    starts = [theta] if bool((sizes.amax(0) > away * sizes.amin(0)).any()) else []
+    system = prepared.dynamics
+    if system is not None and impossible_values(system, fit.parameters):
+        nominal = theta.clone()
+        nominal[:own] = system.given[:own]
+        starts += [] if starts and torch.equal(nominal, theta) else [nominal]
+    moved = []
+    for start in starts:
+        residual = fit.model.residual(start)
+        # a clipped residual: at values that are not fitted any sample may be far
+        value, _ = clipped_residual(residual, fit.recorded)
+        if bool(residual.isfinite().all()):
+            moved.append(replace(fit, parameters=start, residual=value))
+    return moved
 
 
 def fitted_through_noise(noisy: FittedModel, term: Term, size: torch.Tensor) -> FittedModel | None:

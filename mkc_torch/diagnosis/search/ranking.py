@@ -79,7 +79,7 @@ class ModelPrior:
             return 0.0
         sizes = [fit.model.sizes[-1] + _fitted_numbers(fit.model.terms[-1]) for fit in (first, other)]
         return (
-            agreed_innovation_gain(first.residual, other.residual)
+            agreed_innovation_gain(first.residual, other.residual, first.recorded)
             - price * (sizes[1] - sizes[0])
             - (forms[1] - forms[0])
         )

@@ -178,9 +178,13 @@ def _scene(
         best, terms, tangents = _with_tangents(fits, terms, settings)
         around = best
     tangents = replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
-    return best, SearchProblem(
-        base, around, terms, tangents, around.residual, torch.ones_like(around.residual), settings
-    )
+    return best, SearchProblem(base, around, terms, tangents, *_unmasked(around), settings)
+
+
+def _unmasked(fit: FittedModel) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
+    """Return the residual and a mask that rejects only missing outputs."""
+    mask = torch.ones_like(fit.residual) if fit.recorded is None else fit.recorded.to(fit.residual)
+    return mask * fit.residual, mask
 
 
 def _added(best: FittedModel, scene: SearchProblem) -> Float[Tensor, "N m"]:

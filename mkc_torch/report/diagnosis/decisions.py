@@ -24,6 +24,7 @@ _RULES: Mapping[str, str] = MappingProxyType(
         "shape": "no free curve clearly better",
         "visible": "visible in the compared length",
         "residual_reduction": "reduces the residual",
+        "enough_samples": "enough samples for a test",
         "explained_share": "explained share of the variation",
         "each_output": "explained share of each output",
         "simulation_explains_more": "correction at most the simulation",

@@ -14,6 +14,7 @@ from mkc_torch._support.typesetting import several, typeset
 from mkc_torch.diagnosis.plot.drawings import CURVE_COLORS
 from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Separability
 from mkc_torch.report.diagnosis import (
+    before_search,
     decisions,
     environment,
     evidence,
@@ -24,6 +25,7 @@ from mkc_torch.report.diagnosis import (
     pictures,
     summary,
     unseen,
+    untested,
     verdict,
 )
 from mkc_torch.report.drawing import themed
@@ -84,7 +86,9 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "", paths: verdict.Run
         top=verdict,
         lead=summary.summary(d),
         unseen=unseen,
+        before_search=before_search,
         environment=environment,
+        untested=untested,
         several=several,
         typeset=typeset,
         marked=marked,

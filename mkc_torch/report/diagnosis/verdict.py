@@ -62,6 +62,8 @@ def _verdict(diagnosis: Diagnosis) -> str:
     d = diagnosis
     if d.verdict == "unfit":
         return VERDICT_SENTENCES["unfit"]
+    if d.too_few:
+        return f"Not tested for missing physics: {d.samples} samples are too few."
     if d.verdict == "adequate":
         real = [f for f in d.findings if f.grade != "unconfirmed"]
         return f"No missing physics is worth correcting. {_found(real)}" if real else VERDICT_SENTENCES["adequate"]
@@ -165,6 +167,8 @@ def _driven(diagnosis: Diagnosis) -> tuple[bool, list[str]]:
 def unexplained_place(diagnosis: Diagnosis) -> str:
     """Return the place of unexplained structure in a few words; empty if there is none."""
     d = diagnosis
+    if d.too_few:
+        return "not tested; the samples are too few"
     if not unexplained(d):
         return "the intervals of rejected samples" if d.rejected_intervals else ""
     if d.stop is not None:
@@ -213,7 +217,7 @@ def _kinds(diagnosis: Diagnosis) -> dict[str, str]:
 
 def notices_first(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return the notices of a quick look and of a stopped search."""
-    return notices(diagnosis.stop, quick=diagnosis.quick)
+    return notices(diagnosis.stop, quick=diagnosis.quick, too_few=diagnosis.too_few)
 
 
 def _ids(diagnosis: Diagnosis) -> set[str]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mkc_torch.nonlinear import fit
 from mkc_torch.simulation.continuation import Continuation
+from mkc_torch.simulation.dynamics.missing import recorded_weight
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.parameter import SimulationError
 from mkc_torch.simulation.ports import Changes, Nearby
@@ -64,6 +65,8 @@ class DynamicsCorrection:
         for seen in self._horizons():
             if int(seen.sum()) > _SAMPLES_PER_STATE * len(begin) or bool(seen.all()) or self.first is not None:
                 weight = seen.to(theta.dtype)
+                if prepared.recorded is not None:
+                    weight = recorded_weight(prepared.recorded, weight)
                 continuation = Continuation(prepared, lambda begin: (torch.cat([theta[:p], begin]), changes), near)
                 begin = fit(continuation, begin, weight=weight, covariance=None, graduate=True, max_iter=60).theta
                 near = continuation.near(begin)

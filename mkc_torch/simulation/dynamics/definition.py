@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from mkc_torch.recording.join_recordings import Clock
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.correction import DynamicsCorrection
-from mkc_torch.simulation.dynamics.lost_changes import lost_changes
+from mkc_torch.simulation.dynamics.missing import usable_rows
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.dynamics.user_functions import check_names
 from mkc_torch.simulation.own_offsets import OwnOffset
@@ -142,11 +141,9 @@ class Dynamics:
                 f"{self.name}: none of its states ({', '.join(self.states)}) is a column of the recording, which has "
                 f"{', '.join(recording.names)}. Name what is measured in `outputs`."
             )
-        used = recording.finite("time", *self.inputs, *outputs).sorted_by_time()
-        if len(used) < len(recording) and (lost := lost_changes(recording, self.inputs, outputs)):
-            used = used.rows(torch.arange(len(used)), *lost)
+        used = usable_rows(recording, self.inputs, outputs)
         for name in (*self.inputs, *outputs):
-            largest = float(used[name].abs().max())
+            largest = float(used[name].nan_to_num(0.0, posinf=0.0, neginf=0.0).abs().max())
             if largest > MOST:
                 raise SimulationError(
                     f"{self.name}: column `{name}` reaches {largest:.3g}, but at most {MOST:g} is allowed, because "

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.simulation.dynamics.equations import Equations
+from mkc_torch.simulation.dynamics.missing import MissingOutputs
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observer, ObserverJump
 from mkc_torch.simulation.dynamics.user_functions import namespace
 from mkc_torch.simulation.names import Names
@@ -19,7 +20,7 @@ from mkc_torch.simulation.parameter import Parameter
 from mkc_torch.simulation.ports import Changes, FreeChange, Port, SignalTimes
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 
 class ObservedDynamics:
@@ -27,6 +28,7 @@ class ObservedDynamics:
 
     Attributes:
         kinematic: state whose rate is another state, to that state.
+        missing: where outputs are missing; None where none is.
         clean: (N, m), the measured outputs with outliers replaced.
         inputs: (S, u), the inputs at the stations.
         inputs_at_rows: (N, u), the inputs at the samples.
@@ -40,6 +42,7 @@ class ObservedDynamics:
     run: Tensor
     rows: Tensor
     measured: Tensor
+    missing: MissingOutputs | None
     clean: Tensor
     inputs: Tensor
     inputs_at_rows: Tensor
@@ -54,6 +57,11 @@ class ObservedDynamics:
     def ports(self) -> Mapping[str, Port]:
         """The ports at which effects act."""
         raise NotImplementedError
+
+    @property
+    def recorded(self) -> Bool[Tensor, "N m"] | None:
+        """Mask of the samples with a recorded output; None where no output is missing."""
+        return None if self.missing is None else self.missing.recorded
 
     prior: GaussianPrior | None = None
     faults: tuple[str, ...] = ()

@@ -17,25 +17,26 @@ from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.continuation import Meaning, is_plain
 from mkc_torch.simulation.dynamics.between_samples import inputs_between
+from mkc_torch.simulation.dynamics.checked import AT_START, CheckedDynamics
 from mkc_torch.simulation.dynamics.checks import SampledStates, check_functions
 from mkc_torch.simulation.dynamics.compiled.faithful import is_faithful
 from mkc_torch.simulation.dynamics.compiled.residual import CompiledDynamics, compiled_dynamics
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.first_guess import despiked, first_guess
 from mkc_torch.simulation.dynamics.first_parameters import first_parameters
-from mkc_torch.simulation.dynamics.observed import ObservedDynamics
+from mkc_torch.simulation.dynamics.layout import InputRows, lay_out
+from mkc_torch.simulation.dynamics.missing import MissingOutputs, with_lines
 from mkc_torch.simulation.dynamics.observer import Observer
 from mkc_torch.simulation.dynamics.own_offsets import equations_with_offsets
 from mkc_torch.simulation.dynamics.ports import ENTRY, RATES, PortContext, common_unit
 from mkc_torch.simulation.dynamics.refinement import FINEST, enough_parts
 from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
 from mkc_torch.simulation.dynamics.settings import HORIZON
-from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory, marched, solve, stations
+from mkc_torch.simulation.dynamics.trajectory import Trajectory, marched, solve, stations
 from mkc_torch.simulation.dynamics.user_functions import kinematic, namespace
 from mkc_torch.simulation.parameter import known_parameters
-from mkc_torch.simulation.ports import Answer, Changes, Nearby, Port, SignalTimes
+from mkc_torch.simulation.ports import Answer, Changes, Nearby, Port
 from mkc_torch.simulation.runs import experiment_runs
-from mkc_torch.simulation.undetermined import undetermined
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -43,23 +44,28 @@ if TYPE_CHECKING:
 _PATIENT = 2
 """Stride of the growing horizon, in grid times, for trajectories that are hard to solve."""
 
-_NOUGHT = 1e-3
-"""Share of a parameter's start value below which its fitted value does not define its size."""
 
-
-class PreparedDynamics(ObservedDynamics):
+class PreparedDynamics(CheckedDynamics):
     """A system of differential equations with its recording; implements the protocol of a prepared simulation."""
 
     def __init__(self, system: Equations, recording: Recording, outputs: tuple[str, ...]) -> None:
-        self.system, self.recording, self.channels = system, recording, outputs
+        self.system, self.whole, self.channels = system, recording, outputs
         self.name = system.name
-        self.time = recording["time"]
-        self.measured = recording.stack(*outputs)
+        known = recording.stack(*outputs).isfinite()
+        sampled = known.any(-1)
+        samples = recording.rows(sampled)
+        self.time = samples["time"]
+        self.begins, self.labels = beginnings(samples, system)
+        self.missing = MissingOutputs.of(known[sampled], self.time, self.begins)
+        values = samples.stack(*outputs)
+        self.measured = values if self.missing is None else self.missing.replaced(values)
+        self.recording = with_lines(samples, outputs, self.begins)
         self.unit = common_unit(system.units.get(name, recording.units[name]) for name in outputs)
         self.independent = (True,) * len(outputs)
         self.known = known_parameters(system.name, system.parameters)
-        self.begins, self.labels = beginnings(recording, system)
-        self.run = experiment_runs(recording)
+        self.run = experiment_runs(self.recording)
+        self.known_inputs = InputRows.of(recording, system.inputs, sampled, self.begins)
+        self.inputs_at_rows = self.known_inputs.inputs[self.known_inputs.samples]
         self.input_hold = dict.fromkeys(system.inputs, system.input_hold)
         refuse_few(self.begins, system.name)
         self.kinematic = kinematic(system, self.known)
@@ -71,46 +77,36 @@ class PreparedDynamics(ObservedDynamics):
         any_value = [torch.inf] * len(starts)
         self.bounds = self.time.new_tensor([*low, *(-x for x in any_value)]), self.time.new_tensor(high + any_value)
         self.prior = _prior_within(*self.bounds)
-        self._p = len(self.known)
-        self.clean = torch.stack([despiked(values, self.time, self.begins) for values in self.measured.unbind(-1)], -1)
+        self.clean = torch.stack([despiked(self.recording[name], self.time, self.begins) for name in outputs], -1)
         self.counts = self.clean == self.measured
+        if self.missing is not None:
+            self.counts = self.counts & self.missing.recorded
         self._faithful: dict[int, bool] = {}
         self._check_functions()
         self._refine()
 
     def _lay_out(self, parts: int) -> None:
-        """Set up the grid with this many intervals between samples, and everything that depends on the grid."""
-        N, self.parts = len(self.time), parts
-        inside = ~self.begins[1:]
-        count = torch.where(inside, parts, 1)
-        before = torch.arange(N - 1).repeat_interleave(count)
-        part = torch.arange(len(before)) - (count.cumsum(0) - count).repeat_interleave(count)
-        step = 1.0 / count.repeat_interleave(count).double()
-        share = (part.unsqueeze(-1) + torch.tensor([0.0, 0.5, 1.0], dtype=step.dtype)) * step.unsqueeze(-1)
-        # the interval between two runs is empty: time and inputs stay at the end of the first
-        share = torch.where(inside.repeat_interleave(count).unsqueeze(-1), share, 0.0)
-        node_before = torch.cat([before, before[-1:]])
-        node_share = torch.cat([share[:, 0], share[-1:, 2]])
-        time = torch.lerp(self.time[:-1][node_before], self.time[1:][node_before], node_share)
-        self.rows = torch.cat([(count.cumsum(0) - count), torch.tensor([len(before)])])
-        begins = torch.zeros(len(time), dtype=torch.bool)
-        begins[self.rows[self.begins]] = True
-        self.grid = Grid(time, begins)
-        early = before.repeat_interleave(3)
-        at = torch.lerp(self.time[early], self.time[early + 1], share.flatten())
-        self.clock = SignalTimes(at, early, early + 1, share.flatten())
-        inputs = self.recording.stack(*self.system.inputs) if self.system.inputs else self.time.new_zeros(N, 0)
-        self.inputs = self._between(inputs)
-        self.inputs_at_rows = inputs
+        """Set up the grid with this many intervals between rows, and everything that depends on the grid."""
+        found, self.parts = lay_out(self.known_inputs, parts), parts
+        self.grid, self.rows, self.clock, self._input_clock = found.grid, found.rows, found.clock, found.input_clock
+        self.inputs = self._between(self.known_inputs.inputs)
         self.guess = first_guess(
-            self.system, self.recording, self.channels, self.begins, self.kinematic, time, node_before, node_share
+            self.system,
+            self.recording,
+            self.channels,
+            self.begins,
+            self.kinematic,
+            found.grid.time,
+            found.before,
+            found.share,
         )
         self.__dict__.pop("ports", None)  # their clock has the times of the stations
 
-    def _between(self, inputs: Float[Tensor, "N u"]) -> Float[Tensor, "S u"]:
+    def _between(self, inputs: Float[Tensor, "R u"]) -> Float[Tensor, "S u"]:
         """Inputs at the stations."""
+        known = self.known_inputs
         columns = [
-            inputs_between(inputs[:, [k]], how, self.time, self.begins, self.clock)
+            inputs_between(inputs[:, [k]], how, known.time, known.begins, self._input_clock)
             for k, how in enumerate(self.input_hold.values())
         ]
         return torch.cat(columns, -1) if columns else inputs.new_zeros(len(self.clock.time), 0)
@@ -125,8 +121,8 @@ class PreparedDynamics(ObservedDynamics):
         """The simulation with other input interpolation, "held", "linear" or "smooth", by input name."""
         other = copy.copy(self)
         other.input_hold = {**self.input_hold, **between}
-        other.inputs = other._between(self.inputs_at_rows)
-        for known in ("_start", "warnings"):
+        other.inputs = other._between(self.known_inputs.inputs)
+        for known in AT_START:
             other.__dict__.pop(known, None)
         return other
 
@@ -136,7 +132,7 @@ class PreparedDynamics(ObservedDynamics):
             return None
         other = copy.copy(self)
         other._lay_out(2 * self.parts)
-        for known in ("_start", "warnings"):
+        for known in AT_START:
             other.__dict__.pop(known, None)
         return other
 
@@ -170,7 +166,7 @@ class PreparedDynamics(ObservedDynamics):
         near = self.trajectory(theta, {})
         tangents = torch.func.jacfwd(dual_constants(lambda values: self.residual(values, {}, near)))(theta)
         system = equations_with_offsets(self.system, self.channels, self.run, tangents, recording, names)
-        return self if system is None else PreparedDynamics(system, self.recording, self.channels)
+        return self if system is None else PreparedDynamics(system, self.whole, self.channels)
 
     @cached_property
     def ports(self) -> dict[str, Port]:
@@ -190,38 +186,13 @@ class PreparedDynamics(ObservedDynamics):
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:
         return self.observed(None)._start.clone()
 
-    @property
-    def given(self) -> Float[Tensor, " p"]:
-        """The user's values, then the first guess of the initial states."""
-        values = self.time.new_tensor([parameter.value for parameter in self.known.values()])
-        return torch.cat([values, self.guess[self.grid.begins].flatten()])
-
     @cached_property
     def _start(self) -> Float[Tensor, " p"]:
         def rate(theta: Tensor) -> Callable[[Tensor], Tensor]:
             return self.rate(theta, {})
 
         residual, step = partial(self.residual, changes={}), self.grid.step.unsqueeze(-1)
-        return first_parameters(self.given, self.bounds, self._p, rate, self.guess, step, residual)
-
-    @cached_property
-    def warnings(self) -> tuple[str, ...]:
-        """Warnings about parameters that the recording does not determine, near the start of the fit."""
-        if not self._p:
-            return ()
-        if self.observer is not None:
-            return self.observed(None).warnings
-        load_forward_mode()
-        theta = self.start()
-        near = self.trajectory(theta, {})
-        residual = dual_constants(lambda values: self.residual(values, {}, near))
-        tangents = torch.func.jacfwd(residual)(theta).flatten(0, 1)
-        # a value near 0 does not define the parameter's size
-        meant = theta.new_tensor([parameter.value for parameter in self.known.values()])
-        typical = self.guess.abs().median(0).values.repeat(int(self.begins.sum()))
-        meant = torch.cat([meant.abs(), typical])
-        size = torch.where(theta.abs() < _NOUGHT * meant, meant, theta.abs())
-        return undetermined(tangents, size, self.parameter_names, self._p)
+        return first_parameters(self.given, self.bounds, len(self.known), rate, self.guess, step, residual)
 
     def answer(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Answer:
         """The residual and the trajectory; see :meth:`mkc_torch.simulation.PreparedSimulation.answer`."""
@@ -251,7 +222,9 @@ class PreparedDynamics(ObservedDynamics):
 
     def _residual(self, theta: Tensor, changes: Changes, found: Trajectory) -> Float[Tensor, "N m"]:
         left = self.measured - self._simulated(theta, changes, found)
-        return left if self.observer is None else self.observer.whitened(left)
+        left = left if self.missing is None else self.missing.left_out(left)
+        left = left if self.observer is None else self.observer.whitened(left)
+        return left if self.missing is None else self.missing.replaced(left)
 
     def simulated(
         self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
@@ -337,7 +310,7 @@ class PreparedDynamics(ObservedDynamics):
         """Initial states of the runs, with internal states, and the state that each internal state starts equal to."""
         memories = [like for memory in self.remembering(changes).values() for like in memory.values()]
         memories += [""] * len(self.lasting)
-        begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
+        begin = theta[len(self.known) :].unflatten(0, (-1, len(self.system.states)))
         return self.with_memories(begin, memories), memories
 
     def rate(self, theta: Tensor, changes: Changes, inputs: Tensor | None = None) -> Callable[[Tensor], Tensor]:
@@ -425,7 +398,7 @@ class PreparedDynamics(ObservedDynamics):
     def _refine(self) -> None:
         """Set the number of intervals between samples: by the user's step, or until doubling changes nothing."""
         if self.system.step is not None:
-            inside = self.time.diff()[~self.begins[1:]]
+            inside = self.known_inputs.time.diff()[~self.known_inputs.begins[1:]]
             self._lay_out(max(1, int(torch.ceil(inside.max() / self.system.step - 1e-9))))
             return
         theta = self.start()

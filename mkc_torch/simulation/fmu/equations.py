@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.definition import Dynamics
+from mkc_torch.simulation.dynamics.missing import usable_rows
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.fmu.cosimulation import Simulated
 from mkc_torch.simulation.fmu.description import Description, FmuError, FmuVariable, read_description
@@ -78,7 +79,7 @@ class FmuDynamics(Dynamics):
         own = type(self)()
         own.__dict__.update(self.__dict__)
         own.outputs = measured
-        return PreparedDynamics(own, recording.finite("time", *own.inputs, *measured).sorted_by_time(), measured)
+        return PreparedDynamics(own, usable_rows(recording, own.inputs, measured), measured)
 
     def __reduce__(self) -> Any:
         if is_of_an_fmu(type(self)):  # such a class cannot be imported by name

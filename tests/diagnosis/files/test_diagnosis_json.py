@@ -51,7 +51,7 @@ def test_diagnoses_of_every_size_are_written(findings, channels):
 def test_keys_are_those_of_the_format(content):
     assert set(content) == {
         "schema", "recording", "simulation", "samples", "level", "p_value", "verdict", "doubts", "goodness_of_fit",
-        "reasons",
+        "before_the_search", "reasons",
         "noise",
         "search", "findings", "disturbance", "remaining", "baseline", "corrected", "ceiling", "advice", "warnings",
         "notes", "rejected_intervals", "decisions",

@@ -15,7 +15,9 @@ def fits(*residuals):
     """Return fits with these residuals, each with an effect of one amplitude and one fitted shape number."""
     effect = types.SimpleNamespace(fitted_shape={"time_constant": (0.1, 1.0)})
     model = types.SimpleNamespace(sizes=[1], terms=[types.SimpleNamespace(effect=effect)])
-    return [types.SimpleNamespace(model=model, residual=residual.unsqueeze(-1)) for residual in residuals]
+    return [
+        types.SimpleNamespace(model=model, residual=residual.unsqueeze(-1), recorded=None) for residual in residuals
+    ]
 
 
 def noise(seed):

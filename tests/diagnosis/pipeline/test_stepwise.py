@@ -25,7 +25,7 @@ NOTHING = SimpleNamespace(log_likelihood=torch.zeros(N, dtype=torch.float64), re
 
 
 def located(beyond):
-    return SimpleNamespace(beyond=beyond, fit=SimpleNamespace(model=SimpleNamespace(sizes=(3,))))
+    return SimpleNamespace(beyond=beyond, fit=SimpleNamespace(model=SimpleNamespace(sizes=(3,)), recorded=None))
 
 
 @pytest.mark.parametrize(

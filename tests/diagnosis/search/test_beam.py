@@ -15,7 +15,7 @@ from mkc_torch.diagnosis.score import basis_of, score
 from mkc_torch.diagnosis.search import beam as beam_module
 from mkc_torch.diagnosis.search.beam import BeamSearch
 from mkc_torch.diagnosis.search.candidate import Candidate, in_order, model_key
-from mkc_torch.diagnosis.search.move_fits import at_initial_values
+from mkc_torch.diagnosis.search.move_fits import at_other_values
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE_RATE, LARGER
 from mkc_torch.nonlinear import NoFitError
@@ -248,11 +248,17 @@ def test_an_effect_of_a_model_is_tried_at_other_places_whatever_its_linear_gain(
 
 def test_a_fit_far_from_its_initial_values_is_also_tried_from_there():
     fit = start(DRAG, 0.0)
-    assert at_initial_values(fit, 5.0) is None
+    assert at_other_values(fit, 5.0) == []
     away = replace(fit, parameters=torch.cat([20.0 * fit.parameters[:1], fit.parameters[1:]]))
-    there = at_initial_values(away, 5.0)
-    assert there is not None
+    (there,) = at_other_values(away, 5.0)
     torch.testing.assert_close(there.parameters, fit.model.prepared.start())
+
+
+def test_a_fit_at_a_bound_is_also_tried_from_the_nominal_values():
+    fit = start(DRAG, 0.0)
+    at_bound = replace(fit, parameters=torch.cat([torch.zeros_like(fit.parameters[:1]), fit.parameters[1:]]))
+    (there,) = at_other_values(at_bound, float("inf"))
+    assert float(there.parameters[0]) == 1.0
 
 
 def test_the_models_without_one_of_the_effects_are_known_afterwards():

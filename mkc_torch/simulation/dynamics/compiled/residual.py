@@ -48,6 +48,9 @@ class CompiledDynamics:
         self._grid = ArrayGrid(grid.step.numpy(), grid.begins.numpy(), grid.longest)
         self._rows = system.rows.numpy()
         self._places = self._grid.begins.cumsum() - 1
+        missing = system.missing
+        self._recorded = None if missing is None else missing.recorded.numpy().T[:, None]
+        self._nearest = None if missing is None else missing.nearest.numpy().T[:, None]
         self._measured = np.ascontiguousarray(system.measured.numpy().T)
 
     def answer(self, parameters: Float[Tensor, " p"], near: Nearby | None = None) -> Answer:
@@ -163,8 +166,10 @@ class CompiledDynamics:
         return self._traced.first.values(values)(np.empty(0)).reshape(-1, self._traced.width).T
 
     def _whitened(self, rows: Array) -> Array:
-        """Whiten innovations to independent residuals of equal size, (m, K, N)."""
-        return rows if self._white is None else multiplied(self._white, rows)
+        """Whiten innovations to independent residuals of equal size, (m, K, N); missing ones have the nearest value."""
+        rows = rows if self._recorded is None else np.where(self._recorded, rows, 0.0)
+        white = rows if self._white is None else multiplied(self._white, rows)
+        return white if self._nearest is None else np.take_along_axis(white, self._nearest, 2)
 
     def _nearby(self, parameters: Tensor, states: Array, factor: Factor) -> Trajectory:
         system, meaning = self._system, self._meaning

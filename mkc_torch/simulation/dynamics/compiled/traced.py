@@ -23,6 +23,7 @@ from mkc_torch.simulation.dynamics.compiled.symbol import (
     parameter_symbol,
     state_symbol,
 )
+from mkc_torch.simulation.dynamics.missing import MissingOutputs
 from mkc_torch.simulation.dynamics.observer import Observer, ObserverJump
 from mkc_torch.simulation.dynamics.trajectory import Grid
 from mkc_torch.simulation.ports import Changes
@@ -42,6 +43,7 @@ class Traceable(Protocol):
         rows: (N,), grid index of each sample.
         begins: (N,), True where a run starts.
         measured: (N, m), the recorded outputs.
+        missing: where outputs are missing; None where none is.
         guess: (G, n), a first guess of the states.
         inputs: (S, u), the recorded inputs at the stations.
         observer: the observer that corrects the states; None in open loop.
@@ -51,6 +53,7 @@ class Traceable(Protocol):
     rows: Int[Tensor, " N"]
     begins: Bool[Tensor, " N"]
     measured: Float[Tensor, "N m"]
+    missing: MissingOutputs | None
     guess: Float[Tensor, "G n"]
     inputs: Float[Tensor, "S u"]
     observer: Observer | None
