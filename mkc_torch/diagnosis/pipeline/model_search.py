@@ -131,6 +131,7 @@ def _beam(base: ProcessNoiseFit, first: SearchResult, terms: tuple[Term, ...], o
     leaders = [terms[rival.number] for rival in first.ranking[: options.settings.search.own_noise]]
     beam = BeamSearch(terms, basis, options.settings, options.declared)
     beam.noisy = base.fit if has_process_noise(base.fit) and not options.quick else None
+    beam.fixed = options.fixed
     significant = first.p_value <= options.level
     if options.quick:
         beam.most_models = _QUICK_MODELS

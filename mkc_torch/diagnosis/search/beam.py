@@ -24,6 +24,7 @@ from mkc_torch.diagnosis.score import Score, ScoreBasis, is_implausible, score
 from mkc_torch.diagnosis.search.move_fits import (
     POLISHED,
     at_initial_values,
+    fits_at_own_holds,
     fitted_exchanged,
     fitted_held,
     fitted_reordered,
@@ -127,6 +128,7 @@ class BeamSearch:
         most_terms: largest number of effects of a model.
         most_models: largest number of models that the search tries.
         noisy: the simulation alone under its process noise; None without.
+        fixed: inputs whose hold is known.
     """
 
     terms: tuple[Term, ...]
@@ -137,6 +139,7 @@ class BeamSearch:
     most_terms: int = MOST_TERMS
     most_models: int = MOST_MODELS
     noisy: FittedModel | None = None
+    fixed: Mapping[str, str] = field(default_factory=dict)
 
     def run(self, start: FittedModel, further: Sequence[Term] = ()) -> Candidate:
         """Search from the simulation alone; return the model with the highest score.
@@ -282,7 +285,7 @@ class BeamSearch:
 
         From its initial values, if the fit went far from them; and through the process noise of the simulation alone,
         along whose trajectory a strong effect can be fitted that the open loop does not reach. The latter is slow, and
-        is for the candidates that the screening found there.
+        is for the candidates that the screening found there. A delay also starts from the simulation's own holds.
         """
         found: dict[Key, list[Callable[[], FittedModel | None]]] = {}
         there, noisy = at_initial_values(fit, self.settings.search.ran_away), self.noisy
@@ -292,6 +295,8 @@ class BeamSearch:
                     start = torch.cat([there.parameters, size])
                     work = partial(fitted_with_effect, fit, fit.model.with_term(term), start, effort=SEARCH)
                     found.setdefault(addition.key, []).append(work)
+        for key, work in fits_at_own_holds(fit, terms, self.fixed, self.settings.noise):
+            found.setdefault(key, []).append(work)
         if noisy is not None:
             leading = {term.key for term in further}
             led = [term for term in terms if term.key in leading]
