@@ -295,8 +295,8 @@ class BeamSearch:
                     start = torch.cat([there.parameters, size])
                     work = partial(fitted_with_effect, fit, fit.model.with_term(term), start, effort=SEARCH)
                     found.setdefault(addition.key, []).append(work)
-        for key, work in fits_at_own_holds(fit, terms, self.fixed, self.settings.noise):
-            found.setdefault(key, []).append(work)
+        for key, held in fits_at_own_holds(fit, terms, self.fixed, self.settings.noise):
+            found.setdefault(key, []).append(held)
         if noisy is not None:
             leading = {term.key for term in further}
             led = [term for term in terms if term.key in leading]
