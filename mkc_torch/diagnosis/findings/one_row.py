@@ -50,7 +50,10 @@ def with_row_named(finding: Finding, step: float) -> Finding:
     how = "late" if rows > 0 else "early"
     if name.startswith("input "):
         column = name.removeprefix("input ")
-        explanation = f"The input `{column}` acts one row {how}: its delay is one sample, {step:.4g} s, within its standard error."
+        explanation = (
+            f"The input `{column}` acts one row {how}: its delay is one sample, {step:.4g} s, within its standard "
+            "error."
+        )
         advice = (
             f"Shift the column `{column}` by one row, or correct the program that applies each row of the input one "
             f"step {how}."

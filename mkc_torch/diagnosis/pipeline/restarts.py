@@ -12,11 +12,12 @@ from torch import Tensor
 
 from mkc_torch._parallel.deadline import Stopped, limited
 from mkc_torch.diagnosis.goodness_of_fit import size_of
-from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.pipeline.prepare import Problem, prepare
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.result import Diagnosis
+from mkc_torch.diagnosis.thresholds import DISTURBANCE, RESTARTED
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics import Dynamics
@@ -49,7 +50,8 @@ def restarted_problem(
 
     The longest run is halved again and again. For each length the simulation is fitted with initial states of its own
     for each segment, and compared with polynomials in time with as many numbers for each segment. The length at which
-    the simulation explains most of what the polynomials leave, of the output of which it explains least, is chosen.
+    the simulation explains most of what the polynomials leave, of the output of which it explains least, is chosen. It
+    has to explain most of it, and better with the recorded inputs than with constant inputs.
 
     Args:
         problem: the input of the diagnosis.
@@ -67,7 +69,7 @@ def restarted_problem(
     problem.progress("fitting the simulation in segments")
     try:
         with limited(limit, begin=begin):
-            seconds = _best_length(simulation, problem.prepared, options.settings.evidence.followed)
+            seconds = _best_length(simulation, problem.prepared)
     except Stopped:
         return None
     if seconds is None:
@@ -129,26 +131,52 @@ def segment_polynomials(
     return left
 
 
-def _best_length(simulation: Dynamics, whole: PreparedSimulation, least: float) -> float | None:
-    """Return the length in s at which the least explained share is largest; None if it is below ``least`` at all."""
+def _best_length(simulation: Dynamics, whole: PreparedSimulation) -> float | None:
+    """Return the length in s at which the least explained share is largest; None if the simulation does not follow.
+
+    It follows if that share is large, and if the recorded inputs are more likely than constant inputs: segments of a
+    simulation with wrong or unrelated inputs can follow by their initial states alone.
+    """
     assert whole.dynamics is not None
-    found = {}
+    found: dict[float, tuple[float, FittedModel]] = {}
     for seconds in segment_lengths(whole.time, whole.dynamics.begins, len(simulation.states)):
-        share = _explained_share(simulation.with_restarts(seconds), whole)
-        if share is not None and share >= least:
-            found[seconds] = share
-    return max(found, key=lambda seconds: found[seconds], default=None)
+        fit = _fitted(simulation.with_restarts(seconds), whole, whole.recording)
+        share = None if fit is None else _explained_share(fit)
+        if fit is not None and share is not None and share >= RESTARTED:
+            found[seconds] = share, fit
+    best = max(found, key=lambda seconds: found[seconds][0], default=None)
+    if best is None:
+        return None
+    changing = [name for name in simulation.inputs if bool((whole.recording[name] != whole.recording[name][0]).any())]
+    if not changing:
+        return best
+    still = _fitted(simulation.with_restarts(best), whole, _with_constant(whole.recording, changing))
+    return best if still is None or found[best][1].log_likelihood > still.log_likelihood + DISTURBANCE else None
 
 
-def _explained_share(simulation: Dynamics, whole: PreparedSimulation) -> float | None:
-    """Return the least share over the outputs that a restarted simulation explains of the polynomials' residual."""
+def _fitted(simulation: Dynamics, whole: PreparedSimulation, recording: Recording) -> FittedModel | None:
     try:
-        prepared = simulation.prepare(whole.recording).with_input_hold(whole.input_hold)
-        residual = fitted(JointModel(prepared), prepared.start()).residual
+        prepared = simulation.prepare(recording).with_input_hold(whole.input_hold)
+        return fitted(JointModel(prepared), prepared.start())
     except (NoFitError, SimulationError):
         return None
+
+
+def _explained_share(fit: FittedModel) -> float | None:
+    """Return the least share over the outputs that a restarted simulation explains of the polynomials' residual."""
+    prepared = fit.model.prepared.dynamics
+    assert prepared is not None
     # equal numbers of free values in both models, rounded up for the polynomials
-    numbers = -(-len(simulation.states) // len(prepared.channels))
+    numbers = -(-len(prepared.system.states) // len(prepared.channels))
     rival = size_of(segment_polynomials(prepared.measured, prepared.time, prepared.begins, numbers))
-    share = 1.0 - (size_of(residual) / rival).square()
+    share = 1.0 - (size_of(fit.residual) / rival).square()
     return float(share.min()) if bool(share.isfinite().all()) else None
+
+
+def _with_constant(recording: Recording, names: Sequence[str]) -> Recording:
+    """Return a recording with constant columns, at their medians."""
+    columns = {
+        name: recording[name].median().expand(len(recording)) if name in names else recording[name]
+        for name in recording.names
+    }
+    return Recording(columns, name=recording.name, units=recording.units, labels=recording.labels)
