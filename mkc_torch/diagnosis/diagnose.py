@@ -13,12 +13,14 @@ from mkc_torch.diagnosis.model.suspect import texts_of
 from mkc_torch.diagnosis.optional import optional_steps
 from mkc_torch.diagnosis.pipeline.partial import PartialResult, build_result, cut_short, estimate, run_tests
 from mkc_torch.diagnosis.pipeline.prepare import Problem, SearchOptions, prepare
+from mkc_torch.diagnosis.pipeline.restarts import left_by_free_run, restarted_problem, with_restarts_stated
 from mkc_torch.diagnosis.pipeline.search import fit_baseline, stepwise_search
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.diagnosis.thresholds import LEVEL
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
+from mkc_torch.nonlinear import NoFitError
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.protocol import Simulation
 
@@ -109,10 +111,28 @@ def diagnose(
     )
     problem = prepare(simulation, recording, effects, options, time_limit, progress)
     limit = math.inf if time_limit is None else time_limit
-    known = PartialResult(problem)
     with optional_steps() as failed:
-        result = _result_of(problem, known, limit, begin)
+        result = _with_or_without_restarts(problem, recording, limit, begin)
     return replace(result, warnings=(*result.warnings, *failed))
+
+
+def _with_or_without_restarts(
+    problem: Problem, recording: Recording | Sequence[Recording], limit: float, begin: float
+) -> Diagnosis:
+    """Return the diagnosis of the free run; if that is unfit, that with restarts, provided that it is not."""
+    known = PartialResult(problem)
+    try:
+        result = _result_of(problem, known, limit, begin)
+    except NoFitError:
+        again = restarted_problem(problem, recording, limit, begin)
+        if again is None:
+            raise
+        return with_restarts_stated(_result_of(again, PartialResult(again), limit, begin), again)
+    again = restarted_problem(problem, recording, limit, begin) if left_by_free_run(result, known.search) else None
+    if again is None:
+        return result
+    other = _result_of(again, PartialResult(again), limit, begin)
+    return result if other.verdict == "unfit" or other.stop is not None else with_restarts_stated(other, again)
 
 
 def _result_of(problem: Problem, known: PartialResult, limit: float, begin: float) -> Diagnosis:

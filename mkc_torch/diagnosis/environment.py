@@ -166,6 +166,8 @@ class NoiseEnvironment:
         starts: number of starting points that the first fit was tried from.
         offsets: fitted offsets of the outputs in each of several recordings.
         runs: in the order in which findings list their shares; empty for a single run.
+        restart_after: s after which the simulation is restarted, because its free run leaves the recording; None if it
+            is not, or if the simulation itself has restarts.
     """
 
     goodness_of_fit: tuple[GoodnessOfFit, ...] = ()
@@ -176,3 +178,4 @@ class NoiseEnvironment:
     starts: int = 1
     offsets: tuple[Offset, ...] = ()
     runs: tuple[Run, ...] = ()
+    restart_after: float | None = None

@@ -216,6 +216,7 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
             "surrogates": d.surrogates,
             "seed": d.seed,
             "starts": d.environment.starts,
+            "restart_after": d.environment.restart_after,
             "quick": d.quick,
             "stopped": None if d.stop is None else asdict(d.stop),
         },

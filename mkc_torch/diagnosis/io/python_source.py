@@ -31,6 +31,7 @@ _FROM_HERE: Mapping[str, str] = {
     "lagged(": "from mkc_torch.effects import lagged",
     "played(": "from mkc_torch.effects import played",
     "shifted(": "from mkc_torch.effects import shifted",
+    "since_start(": "from mkc_torch.effects import since_start",
     "soft_clip(": "from mkc_torch.effects import soft_clip",
     "curve_within(": "from mkc_torch.effects import curve_within",
     "beyond(": "from mkc_torch.effects import beyond",
@@ -89,6 +90,7 @@ def python_source(
         "    }",
         *_inputs(system, terms),
         *_hold(system, holds),
+        *_restarts(system),
         *_states(system, memories, theta),
         *_actuator(inputs),
         *_entering(entering),
@@ -163,6 +165,12 @@ def _hold(system: Dynamics, holds: Mapping[str, str]) -> list[str]:
     """Return the line of the inputs' hold, if the diagnosis chose another than that of the class."""
     chosen = set(holds.values())
     return [f'    input_hold = "{chosen.pop()}"'] if len(chosen) == 1 and chosen != {system.input_hold} else []
+
+
+def _restarts(system: Dynamics) -> list[str]:
+    """Return the line of the restarts, if the diagnosis chose them."""
+    chosen = system.restart_after
+    return [f"    restart_after = {chosen!r}"] if chosen != type(system).restart_after else []
 
 
 def _states(system: Dynamics, memories: Mapping[str, str], theta: Sequence[float]) -> list[str]:

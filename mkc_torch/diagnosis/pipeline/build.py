@@ -19,6 +19,7 @@ from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.findings.alternatives import with_parameters
 from mkc_torch.diagnosis.findings.finding import finding_of, separability
 from mkc_torch.diagnosis.findings.noise import forcing_of, noise_summary, process_noise_of
+from mkc_torch.diagnosis.findings.one_row import with_row_named
 from mkc_torch.diagnosis.findings.reasons import reasons_of
 from mkc_torch.diagnosis.findings.shape import shape_of
 from mkc_torch.diagnosis.findings.warnings import evidence_warnings
@@ -260,6 +261,7 @@ def _graded(
     quick, settings = whole.options.quick, whole.options.settings
     finding = replace(finding_of(found[number], final, number, quick=quick), evidence=answers.of_findings[number])
     finding = replace(finding, clearly_better=_clearly_better(answers.case.fits, number, settings.naming))
+    finding = with_row_named(finding, float(answers.case.prepared.time.diff().median()))
     in_short = whole.in_short or not any(result.test == "held_out" for result in finding.evidence)
     if not in_short:
         step = f"testing the shape of {finding.effect}, and its alternatives"

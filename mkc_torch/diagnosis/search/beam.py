@@ -24,6 +24,7 @@ from mkc_torch.diagnosis.search.candidate import Candidate, ModelKey, in_order, 
 from mkc_torch.diagnosis.search.move_fits import (
     POLISHED,
     at_other_values,
+    fits_at_own_holds,
     fitted_exchanged,
     fitted_held,
     fitted_reordered,
@@ -241,7 +242,8 @@ class BeamSearch:
 
         From its initial values, if the fit went far from them or to values that cannot be; and through the process
         noise of the simulation alone, along whose trajectory a strong effect can be fitted that the open loop does not
-        reach. The latter is slow, and is for the candidates that the screening found there.
+        reach. The latter is slow, and is for the candidates that the screening found there. A delay also starts from
+        the simulation's own holds.
         """
         found: dict[Key, list[Callable[[], FittedModel | None]]] = {}
         noisy = self.noisy
@@ -251,6 +253,8 @@ class BeamSearch:
                     start = torch.cat([there.parameters, size])
                     work = partial(fitted_with_effect, fit, fit.model.with_term(term), start, effort=SEARCH)
                     found.setdefault(addition.key, []).append(work)
+        for key, held in fits_at_own_holds(fit, terms, self.fixed, self.settings.noise):
+            found.setdefault(key, []).append(held)
         if noisy is not None:
             leading = {term.key for term in further}
             led = [term for term in terms if term.key in leading]

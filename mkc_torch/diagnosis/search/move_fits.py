@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 
@@ -19,8 +20,9 @@ from mkc_torch.diagnosis.model.fit import (
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import shape_fitted, with_form_of_grid
 from mkc_torch.diagnosis.model.simpler import simpler_start
-from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.search.moves import Addition, at_size_zero
+from mkc_torch.diagnosis.model.term import Key, Term
+from mkc_torch.diagnosis.search.moves import Addition, additions, at_size_zero
+from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.impossible import impossible_values
 
@@ -59,6 +61,49 @@ def at_other_values(fit: FittedModel, away: float) -> list[FittedModel]:
         if bool(residual.isfinite().all()):
             moved.append(replace(fit, parameters=start, residual=value))
     return moved
+
+
+def at_own_holds(fit: FittedModel, fixed: Mapping[str, str]) -> FittedModel | None:
+    """Return the fit with the simulation's own holds of its inputs; None if it has them, or if that fit fails.
+
+    Args:
+        fit: of the simulation alone.
+        fixed: inputs whose hold is known.
+    """
+    prepared = fit.model.prepared
+    if prepared.dynamics is None:
+        return None
+    own = dict.fromkeys(prepared.input_hold, prepared.dynamics.system.input_hold) | dict(fixed)
+    if own == dict(prepared.input_hold):
+        return None
+    moved = JointModel(prepared.with_input_hold(own), fit.model.terms, fit.model.near)
+    try:
+        return fitted(moved, fit.parameters, fit.bound, fresh=True)
+    except NoFitError:
+        return None
+
+
+def fits_at_own_holds(
+    fit: FittedModel, terms: Sequence[Term], fixed: Mapping[str, str], settings: NoiseSettings
+) -> Iterator[tuple[Key, Callable[[], FittedModel]]]:
+    """Yield fits of each delay, lag and clock from the simulation's own holds of its inputs, if the fit has others.
+
+    A hold imitates a delay of half a sample, so the most likely hold of the simulation alone can hide a part of it.
+
+    Args:
+        fit: of the simulation alone.
+        terms: the candidates.
+        fixed: inputs whose hold is known.
+        settings: of the noise.
+    """
+    held = at_own_holds(fit, fixed)
+    if held is None:
+        return
+    in_time = [term for term in terms if term.effect.remembers]
+    for addition in additions(held, in_time, settings):
+        for term, size in addition.starts[:POLISHED]:
+            start = torch.cat([held.parameters, size])
+            yield addition.key, partial(fitted_with_effect, held, held.model.with_term(term), start, effort=SEARCH)
 
 
 def fitted_through_noise(noisy: FittedModel, term: Term, size: torch.Tensor) -> FittedModel | None:

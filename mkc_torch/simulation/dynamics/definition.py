@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -126,6 +127,12 @@ class Dynamics:
     def joint_clock(self) -> Clock:
         return "restart" if self.joins_experiments else "follow"
 
+    def with_restarts(self, seconds: float) -> Dynamics:
+        """Return a copy whose runs are split into segments of this length in s, see ``restart_after``."""
+        other = copy.copy(self)
+        other.restart_after = seconds
+        return other
+
     def prepare(self, recording: Recording) -> PreparedDynamics:
         """Prepare the simulation of a recording; the column ``experiment`` separates its runs.
 
@@ -154,4 +161,6 @@ class Dynamics:
     def correction(self, state: Mapping[str, Any], recording: Recording) -> DynamicsCorrection:
         """Prepare the simulation for a new recording; see :class:`mkc_torch.simulation.Correction`."""
         holds = {name: how for name, how in state.get("input_hold", {}).items() if name in self.inputs}
-        return DynamicsCorrection(self.prepare(recording).with_input_hold(holds))
+        seconds = state.get("restart_after")
+        system = self if seconds is None else self.with_restarts(seconds)
+        return DynamicsCorrection(system.prepare(recording).with_input_hold(holds))

@@ -113,9 +113,11 @@ class PreparedDynamics(CheckedDynamics):
 
     @property
     def state(self) -> Mapping[str, object]:
-        """The measured outputs, and the inputs' behaviour between samples, which a diagnosis may have chosen."""
+        """The measured outputs, and the inputs' holds and the restarts, which a diagnosis may have chosen."""
         holds = {"input_hold": dict(self.input_hold)} if self.input_hold else {}
-        return {"class": self.system.name, "outputs": list(self.channels), **holds}
+        seconds = self.system.restart_after
+        restarts = {} if seconds is None else {"restart_after": seconds}
+        return {"class": self.system.name, "outputs": list(self.channels), **holds, **restarts}
 
     def with_input_hold(self, between: Mapping[str, str]) -> PreparedDynamics:
         """The simulation with other input interpolation, "held", "linear" or "smooth", by input name."""
