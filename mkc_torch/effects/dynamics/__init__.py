@@ -15,6 +15,7 @@ from mkc_torch.effects.dynamics.dead_zone import DeadZone
 from mkc_torch.effects.dynamics.driver_exchange import DriverExchange
 from mkc_torch.effects.dynamics.driver_force import DriverForce
 from mkc_torch.effects.dynamics.driver_input_gain import DriverInputGain
+from mkc_torch.effects.dynamics.driver_parameter import DriverParameter
 from mkc_torch.effects.dynamics.driver_rate_constant import DriverRateConstant
 from mkc_torch.effects.dynamics.hard_stop import HardStop
 from mkc_torch.effects.dynamics.hidden_lag import HiddenLag
@@ -75,6 +76,7 @@ DYNAMICS: tuple[Effect, ...] = (
     InputSaturation(),
     DeadZone(),
     DriverInputGain(),
+    DriverParameter(),
     Backlash(),
     SensorLag(),
     UnknownRate("difference"),

@@ -1,4 +1,4 @@
-"""Ports of a system of differential equations, where effects act: rates, exchanges, inputs and outputs."""
+"""Ports of a system of differential equations, where effects act: rates, exchanges, inputs, parameters, outputs."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from mkc_torch.effects.kinds import CELSIUS, kind_of
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.surroundings import surroundings
+from mkc_torch.simulation.dynamics.varying import varying_parameters
+from mkc_torch.simulation.parameter import Parameter
 from mkc_torch.simulation.ports import Port, SignalSizes, SignalTimes
 
 if TYPE_CHECKING:
@@ -59,7 +61,7 @@ class PortContext:
     run: Int[Tensor, " N"]
 
     def ports(self) -> dict[str, Port]:
-        """The ports: the rate of each state, exchanges between states of the same unit, each input, and the outputs."""
+        """The ports: rates, exchanges between states of the same unit, inputs, parameters, and the outputs."""
         system = self.system
         places = {}
         for state in system.states:
@@ -94,6 +96,20 @@ class PortContext:
                 parts={"own": name, **actuator},
                 part_units={"own": self._unit_of(name)},
                 sizes={"own": SignalSizes.of(self.recording[name])},
+                clock=self.clock,
+                run=self.run[self.clock.before],
+            )
+        for name in varying_parameters(system):
+            parameter = system.parameters[name]
+            known = parameter if isinstance(parameter, Parameter) else Parameter(float(parameter))
+            places[f"parameter {name}"] = Port(
+                (name,),
+                known.unit,
+                pointwise=False,
+                kind="parameter",
+                parts={"own": name},
+                part_units={"own": known.unit},
+                sizes={"own": SignalSizes(*(abs(known.value),) * 2, known.value, known.value)},
                 clock=self.clock,
                 run=self.run[self.clock.before],
             )

@@ -1,0 +1,51 @@
+"""A parameter of the simulation that depends on a recorded column."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.effects.base import GainEffect
+from mkc_torch.effects.context import Context, Quantity, Shape
+from mkc_torch.effects.waveforms import per
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class DriverParameter(GainEffect):
+    """A parameter depends on a recorded column: a resistance on temperature, a drag on density, a rate on the flow.
+
+    Simulation: replaces a parameter p by ``p (1 + γ (d − d̄))``; d̄ is the column's mean.
+    Drivers: any column.
+    Units: γ per unit of the column.
+    Plausible: any size, either sign.
+    Source: temperature coefficients, such as that of resistance, IEC 60751; linear in the cause.
+    """
+
+    id = "driver_parameter"
+    display_name = "parameter that depends on a column"
+    port = "parameter"
+    follows_signal = True
+    needs: tuple[str, ...] = ("own",)
+    roles: tuple[str, ...] = ("any", "temperature", "current")
+    gain = "per_unit"
+    equation = "δp = γ (d − d̄) p"
+    explanation = "The parameter depends on this column."
+    advice = "Let the parameter depend on the column, and fit it again."
+    source = "temperature coefficients, such as that of resistance, IEC 60751; linear in the cause"
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
+        return (Quantity(self.gain, 1, per("1", context.units[0]) if context.units[0] else ""),)
+
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+        return context.drivers[:, 0] * context.part("own")
+
+    def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
+        name, unit = context.channels[0], per("", context.units[0])
+        return f"`{name}` changes by {100.0 * gamma[0]:.3g} %{f' per {unit[1:]}' if unit else ''} with this column."
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        return (f"{gamma[0]!r} * {names['driver']} * {names['own']}",)
