@@ -69,10 +69,12 @@ def python_source(
     memories = {name: like for term in terms for name, like in _memories(term).items()}
     inputs: list[str] = []
     outputs: list[str] = []
+    varied: list[str] = []
     for number in in_order_of_the_chain(terms, range(len(terms))):
         term, gamma = terms[number], gammas[number]
         lines = _lines(term, [_rounded(float(value)) for value in gamma], system, measured)
-        place = outputs if term.port == "output" else inputs if term.port.startswith("input ") else rates
+        kind_of_port = term.port.partition(" ")[0]
+        place = {"output": outputs, "input": inputs, "parameter": varied}.get(kind_of_port, rates)
         if place is outputs and outputs:
             place.append("y = dict(shown)")  # the next effect acts on these outputs
         place += [f"# {term.effect.id}: {term.effect.equation}", *lines]
@@ -87,8 +89,9 @@ def python_source(
         *_inputs(system, terms),
         *_hold(system, holds),
         *_states(system, memories, theta),
-        *_actuator(inputs),
-        *_derivative(memories, rates),
+        *_varied(varied),
+        *_actuator(inputs, varied if kind.actuator is not Dynamics.actuator else []),
+        *_derivative(memories, rates, varied),
         *_sensor(outputs),
     ]
     text = "\n".join(body)
@@ -174,14 +177,38 @@ def _states(system: Dynamics, memories: Mapping[str, str], theta: Sequence[float
     return [*lines, f"    initial = {{**{base}.initial, {guessed}}}"] if guessed else lines
 
 
-def _actuator(inputs: list[str]) -> list[str]:
-    if not inputs:
+def _varied(varied: list[str]) -> list[str]:
+    """Return the method of the parameters that effects change, and the output with them."""
+    if not varied:
         return []
-    lines = ["acting = SimpleNamespace(**vars(u))", *inputs, "return super().actuator(time, acting, p, run)"]
+    lines = ["p = SimpleNamespace(**vars(p))", *varied, "return p"]
+    return [
+        "",
+        "    def varied(self, u, p):",
+        *(f"        {line}" for line in lines),
+        "",
+        "    def output(self, time, x, u, p):",
+        "        return super().output(time, x, u, self.varied(u, p))",
+    ]
+
+
+def _actuator(inputs: list[str], varied: list[str]) -> list[str]:
+    if not inputs and not varied:
+        return []
+    p = "self.varied(u, p)" if varied else "p"
+    acting = ["acting = SimpleNamespace(**vars(u))", *inputs] if inputs else []
+    lines = [*acting, f"return super().actuator(time, {'acting' if inputs else 'u'}, {p}, run)"]
     return ["", "    def actuator(self, time, u, p, run):", *(f"        {line}" for line in lines)]
 
 
-def _derivative(memories: Mapping[str, str], rates: list[str]) -> list[str]:
+def _derivative(memories: Mapping[str, str], rates: list[str], varied: list[str]) -> list[str]:
+    p = "self.varied(u, p)" if varied else "p"
+    if not rates and varied:
+        return [
+            "",
+            "    def derivative(self, time, x, u, p):",
+            f"        return super().derivative(time, x, u, {p})",
+        ]
     if not rates:
         return []
     still = [f'rates["{name}"] = torch.zeros_like(x.{name})' for name in memories]
@@ -191,7 +218,7 @@ def _derivative(memories: Mapping[str, str], rates: list[str]) -> list[str]:
         *(f"        {line}" for line in ["rates = self.plain_rates(time, x, u, p)", *still, *rates, "return rates"]),
         "",
         "    def plain_rates(self, time, x, u, p):",
-        "        rates = super().derivative(time, x, u, p)",
+        f"        rates = super().derivative(time, x, u, {p})",
         '        return dict(rates) if hasattr(rates, "keys") else dict(zip(self.states, rates))',
     ]
 
@@ -233,6 +260,9 @@ def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Seque
     elif term.port.startswith("input "):
         name = term.port.removeprefix("input ")
         targets, names = [f"acting.{name}"], {"own": f"acting.{name}"}
+    elif term.port.startswith("parameter "):
+        name = term.port.removeprefix("parameter ")
+        targets, names = [f"p.{name}"], {"own": f"p.{name}"}
     else:
         targets, names = [f'shown["{name}"]' for name in measured], {name: f'y["{name}"]' for name in measured}
     added = term.effect.code(gamma, shape, {**names, **_driver_names(term, names)})

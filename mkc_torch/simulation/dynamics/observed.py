@@ -195,22 +195,17 @@ class ObservedDynamics:
         n, extra = len(self.system.states), len(self.lasting)
         memories = sum(len(memory) for memory in self.remembering(changes).values())
         places = (*range(n), *range(n + memories, n + memories + extra))
-        acting = self.acting_at_samples(theta, changes) if acting is None else acting
-        by_states = self.predicted(acting)
+        by_states = self.predicted(self.acting_at_samples(theta, changes) if acting is None else acting)
 
         def predict(states: Tensor) -> Tensor:
             return by_states(states) + self.output_disturbance(states)
 
-        return ObserverJump(self.observer, self.rows, places, self.seen(theta, changes, acting.parameters), predict)
+        return ObserverJump(self.observer, self.rows, places, self.seen(theta, changes), predict)
 
-    def seen(self, theta: Tensor, changes: Changes, parameters: Names | None = None) -> Float[Tensor, "N m"]:
-        """The recording minus the contributions of sensors and output effects, which may depend on earlier outputs.
-
-        ``parameters`` are the acting parameters at the samples if they are known.
-        """
+    def seen(self, theta: Tensor, changes: Changes) -> Float[Tensor, "N m"]:
+        """The recording minus the contributions of sensors and output effects, which may depend on earlier outputs."""
         clean = dict(zip(self.channels, self.clean.unbind(-1), strict=True))
-        p = self.parameters_at_samples(theta, changes) if parameters is None else parameters
-        sensor = self.system.sensor(self.time, clean, p, self.run)
+        sensor = self.system.sensor(self.time, clean, self.parameters_of(theta), self.run)
         made = torch.stack([sensor[name] - clean[name] for name in self.channels], -1)
         if "output" in changes:
             made = made + changes["output"](self.clean + made)

@@ -292,7 +292,8 @@ class PreparedDynamics(ObservedDynamics):
         at |= {f"input {name}": self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
         still = torch.zeros_like(self.clock.time).unsqueeze(-1)
         p = self.parameters_of(theta)
-        at |= {name: getattr(p, port.channels[0]) + still for name, port in self.ports.items() if port.kind == "parameter"}
+        varying = [port.channels[0] for port in self.ports.values() if port.kind == "parameter"]
+        at |= {f"parameter {name}": getattr(p, name) + still for name in varying}
         return at | {"output": outputs}
 
     def trajectory(
@@ -378,9 +379,7 @@ class PreparedDynamics(ObservedDynamics):
         u = namespace(self.system.inputs, acting.inputs)
         return self._derivative(self.clock.time, states, u, acting.parameters)
 
-    def _signal(
-        self, port: Port, acting: Acting, states: Tensor, rates: Sequence[Tensor]
-    ) -> Float[Tensor, "S k"]:
+    def _signal(self, port: Port, acting: Acting, states: Tensor, rates: Sequence[Tensor]) -> Float[Tensor, "S k"]:
         """Signal at a rate port: the states and inputs, then the rate or the load where the port has it."""
         own, inputs, p = self.system.states.index(port.parts["own"]), *acting
         if "rate" in port.parts:

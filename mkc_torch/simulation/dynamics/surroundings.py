@@ -62,7 +62,11 @@ def _unit_of(system: Equations, name: str) -> str:
 
 def _shifts(system: Equations, known: dict[str, Parameter], state: str, alike: list[str], name: str) -> bool:
     """Whether the rate of a state depends on the states of its unit only by their difference to an input."""
-    time, states, inputs = scattered(_ROWS, 1), scattered(_ROWS, len(system.states)), scattered(_ROWS, len(system.inputs))
+    time, states, inputs = (
+        scattered(_ROWS, 1),
+        scattered(_ROWS, len(system.states)),
+        scattered(_ROWS, len(system.inputs)),
+    )
     # a parameter of 0 would hide what it multiplies; with a coefficient of 1 any input may look like the surroundings
     values = {
         parameter: (known[parameter].value or 1.0) * (1.0 + 0.01 * math.sqrt(number + 2.0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -21,6 +21,10 @@ _ROWS = 20
 """Number of moments at which the functions are compared; no usual number of states, inputs or parameters."""
 
 
+_OTHER = 1.1
+"""Factor by which a parameter is changed to find out whether the sensor depends on it."""
+
+
 class Acting(NamedTuple):
     """The inputs and the parameters as they act, with effects and the actuator, at S moments.
 
@@ -36,8 +40,8 @@ class Acting(NamedTuple):
 def varying_parameters(system: Equations) -> tuple[str, ...]:
     """Find the parameters that a system's functions also accept as a function of time.
 
-    A function that needs a number, such as a condition on a parameter or a lag, does not accept it. Offsets of single
-    recordings are left out.
+    A function that needs a number, such as a condition on a parameter or a lag, does not accept it. Parameters of the
+    sensor, which has no inputs, and offsets of single recordings are left out.
 
     Args:
         system: the equations.
@@ -65,28 +69,41 @@ def _accepts(system: Equations, name: str) -> bool:
         for key, parameter in system.parameters.items()
     }
     numbers = {key: torch.tensor(value).double() for key, value in values.items()}
-    column = numbers[name].expand(_ROWS).clone()
+    column, other = numbers[name].expand(_ROWS).clone(), _OTHER * numbers[name]
     # a user's function may raise anything on a column
     try:
         plain, varied = (_values(system, Names(**{**numbers, name: value})) for value in (numbers[name], column))
+        before, after = (_measured(system, Names(**{**numbers, name: value})) for value in (numbers[name], other))
     except Exception:
         return False
+    return _alike(plain, varied) and _alike(before, after)
+
+
+def _alike(first: Sequence[Tensor], other: Sequence[Tensor]) -> bool:
     return all(
         a.shape == b.shape and torch.allclose(a, b, rtol=1e-9, equal_nan=True)
-        for a, b in zip(plain, varied, strict=True)
+        for a, b in zip(first, other, strict=True)
     )
 
 
 def _values(system: Equations, p: Names) -> list[Tensor]:
-    """The values of all functions of the system at fixed scattered states and inputs."""
+    """The acting inputs, rates and outputs at fixed scattered states and inputs."""
     time, run = torch.arange(_ROWS, dtype=torch.float64), torch.zeros(_ROWS, dtype=torch.long)
     x = namespace(system.states, scattered(_ROWS, len(system.states)))
     given = namespace(system.inputs, scattered(_ROWS, len(system.inputs)))
     u = Names(**system.actuator(time, given, p, run))
     found: Any = system.derivative(time, x, u, p)
     rates = [found[state] for state in system.states] if isinstance(found, Mapping) else list(found)
-    shown = system.sensor(time, system.output(time, x, u, p), p, run)
+    shown = system.output(time, x, u, p)
     return [value + torch.zeros_like(time) for value in (*vars(u).values(), *rates, *shown.values())]
+
+
+def _measured(system: Equations, p: Names) -> list[Tensor]:
+    """What the sensors show of fixed scattered outputs."""
+    time, run = torch.arange(_ROWS, dtype=torch.float64), torch.zeros(_ROWS, dtype=torch.long)
+    names = dict.fromkeys((*system.outputs, *system.states))
+    y = dict(zip(names, scattered(_ROWS, len(names)).unbind(-1), strict=True))
+    return [value + torch.zeros_like(time) for value in system.sensor(time, y, p, run).values()]
 
 
 def varied(

@@ -160,7 +160,9 @@ def _at_stations(system: Traceable, meaning: Meaning, parameters: Symbol) -> Act
     try:
         return Acting(inputs, system.acting_parameters(*meaning(parameters)))
     except Exception:  # a function may raise anything on a symbol; torch computes it instead, or raises again
-        return Acting(inputs, _courses(system, meaning, parameters, system.acting_parameters, len(system.grid.stations)))
+        return Acting(
+            inputs, _courses(system, meaning, parameters, system.acting_parameters, len(system.grid.stations))
+        )
 
 
 def _at_samples(system: Traceable, meaning: Meaning, parameters: Symbol) -> Acting:
