@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkc_torch.diagnosis.model.joint import in_order_of_the_chain
-from mkc_torch.effects.kinds import zero_of
+from mkc_torch.effects.kinds import absolute_zero, zero_of
 from mkc_torch.recording.recording import DEFAULT_UNITS
 from mkc_torch.simulation.dynamics.definition import Dynamics
 from mkc_torch.simulation.dynamics.ports import memory_at
@@ -297,8 +297,11 @@ def _driver_names(term: Term, names: Mapping[str, str]) -> dict[str, str]:
     if term.driver is None:
         return {}
     recorded, mean = f"u.{term.driver.columns[0]}", _rounded(float(term.driver.reference[0]))
+    absolute = absolute_zero(term.driver.units[0], mean)
     return {
         "recorded": recorded,
+        "absolute": f"({recorded} + {absolute!r})",
+        "absolute_mean": repr(_rounded(mean + absolute)),
         "driver": f"({recorded} - {mean!r})" if mean >= 0 else f"({recorded} + {-mean!r})",
         "zero_of_driver": repr(zero_of(term.driver.units[0])) if term.driver.units[0] else names.get("zero", "0.0"),
     }

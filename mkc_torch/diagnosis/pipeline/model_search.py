@@ -31,6 +31,7 @@ from mkc_torch.diagnosis.pipeline.trail import trail_of
 from mkc_torch.diagnosis.score import basis_of, score, separation
 from mkc_torch.diagnosis.search.beam import BeamSearch, Candidate, in_order
 from mkc_torch.diagnosis.search.columns import best_change
+from mkc_torch.diagnosis.search.moves import comes_by_exchange
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.search.screening import screened
@@ -128,7 +129,8 @@ def _beam(base: ProcessNoiseFit, first: SearchResult, terms: tuple[Term, ...], o
     """
     start = _start(base)
     basis = basis_of(base.fit, len({term.key for term in terms}), options.declared, options.settings)
-    leaders = [terms[rival.number] for rival in first.ranking[: options.settings.search.own_noise]]
+    ranked = [term for term in (terms[rival.number] for rival in first.ranking) if not comes_by_exchange(term)]
+    leaders = ranked[: options.settings.search.own_noise]
     beam = BeamSearch(terms, basis, options.settings, options.declared)
     beam.noisy = base.fit if has_process_noise(base.fit) and not options.quick else None
     significant = first.p_value <= options.level
@@ -189,11 +191,16 @@ def _in_turn(beam: BeamSearch) -> list[list[Candidate]]:
     good = [model for model in ranked if model.value > alone.value]
     behind = beam.settings.naming.separable * beam.basis.kappa
     alike = [model for model in good if model.value >= good[0].value - behind]
-    for model in [*sorted(alike, key=lambda model: model.price), *good[len(alike) :]]:
+    for model in [*sorted(alike, key=_simplest), *good[len(alike) :]]:
         chain = _chain(model, beam)
         if all(later.value > earlier.value for earlier, later in itertools.pairwise([alone, *chain])):
             return [chain, *[other for other in single if other[0].key != chain[0].key]][:_NEXT]
     return single[:_NEXT]
+
+
+def _simplest(model: Candidate) -> tuple[float, int]:
+    """Order models by price, and at equal price by the number of effects that have a form to first order."""
+    return round(model.price, 6), sum(comes_by_exchange(term) for term in model.fit.model.terms)
 
 
 def _named(models: Sequence[Candidate], alone: Candidate) -> list[Candidate]:

@@ -36,6 +36,7 @@ from mkc_torch.diagnosis.search.moves import (
     Addition,
     additions,
     at_size_zero,
+    comes_by_exchange,
     in_other_orders,
     special_cases,
     with_wide_grid,
@@ -267,6 +268,7 @@ class BeamSearch:
             if rest is None:
                 continue
             near = [other for other in terms if ports[other.port].channels == ports[term.port].channels]
+            near = [other for other in near if not comes_by_exchange(other)]
             found = sorted(additions(rest.fit, near, self.settings.noise), key=self._worth, reverse=True)
             for addition in [other for other in found if other.key != term.key][:_EXCHANGES]:
                 other = addition.starts[0][0]
@@ -315,6 +317,7 @@ class BeamSearch:
     ) -> list[Addition]:
         """Return the additions to fit: the largest linear gains, less the price of the effect's numbers."""
         most = _ADDITIONS[min(rank, len(_ADDITIONS) - 1)]
+        found = [addition for addition in found if not comes_by_exchange(addition.starts[0][0])]
         ranked = sorted(found, key=self._worth, reverse=True)
         if model.fit.model.terms:
             own = {term.effect.id for term in model.fit.model.terms}

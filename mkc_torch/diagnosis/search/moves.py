@@ -214,6 +214,14 @@ def special_cases(term: Term, terms: Sequence[Term], prepared: PreparedSimulatio
     return found
 
 
+def comes_by_exchange(term: Term) -> bool:
+    """Whether an effect is tried only in exchange for its special case: a further form of a dependence on a column.
+
+    Otherwise the forms of one dependence would take the places of other effects among the additions.
+    """
+    return term.driver is not None and term.effect.reduces_to is not None
+
+
 def in_other_orders(fit: FittedModel) -> list[tuple[Term, ...]]:
     """Return the effects with one static effect before or behind those with memory, where both are in series.
 

@@ -16,6 +16,8 @@ from mkc_torch.effects.dynamics.driver_exchange import DriverExchange
 from mkc_torch.effects.dynamics.driver_force import DriverForce
 from mkc_torch.effects.dynamics.driver_input_gain import DriverInputGain
 from mkc_torch.effects.dynamics.driver_parameter import DriverParameter
+from mkc_torch.effects.dynamics.driver_parameter_arrhenius import DriverParameterArrhenius
+from mkc_torch.effects.dynamics.driver_parameter_quadratic import DriverParameterQuadratic
 from mkc_torch.effects.dynamics.driver_rate_constant import DriverRateConstant
 from mkc_torch.effects.dynamics.hard_stop import HardStop
 from mkc_torch.effects.dynamics.hidden_lag import HiddenLag
@@ -77,6 +79,8 @@ DYNAMICS: tuple[Effect, ...] = (
     DeadZone(),
     DriverInputGain(),
     DriverParameter(),
+    DriverParameterQuadratic(),
+    DriverParameterArrhenius(),
     Backlash(),
     SensorLag(),
     UnknownRate("difference"),
