@@ -39,7 +39,7 @@ def declared_ports(simulation: Simulation) -> Mapping[str, Port]:
         ...     def derivative(self, time, x, u, p):
         ...         return {"level": u.inflow - p.drain * x.level}
         >>> list(declared_ports(Tank()))
-        ['rate of level', 'lagged rate of level', 'resonant rate of level', 'input inflow', 'output']
+        ['rate of level', 'lagged rate of level', 'resonant rate of level', 'input inflow', 'parameter drain', 'output']
     """
     if isinstance(simulation, Dynamics):
         return _of_equations(simulation)

@@ -41,6 +41,10 @@ def dynamic_context(effect, N=80, driven=False):
         parts, units = {"own": "force"}, {"own": "N"}
         signal = oscillating(N, 1)
         return Context(time, drivers, driver_units, signal, "N", ("force",), (), parts, units, None, means)
+    if effect.port == "parameter":
+        signal = time.new_full((N, 1), 1.7)
+        parts, units = {"own": "drag"}, {"own": "1/m"}
+        return Context(time, drivers, driver_units, signal, "1/m", ("drag",), (), parts, units, None, means)
     names = ("angle", "speed", "other", "load", "rate")
     parts = {
         "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "reversing": "speed",

@@ -300,7 +300,6 @@ def _driver_names(term: Term, names: Mapping[str, str]) -> dict[str, str]:
     absolute = absolute_zero(term.driver.units[0], mean)
     return {
         "recorded": recorded,
-        "absolute": f"({recorded} + {absolute!r})",
         "absolute_mean": repr(_rounded(mean + absolute)),
         "driver": f"({recorded} - {mean!r})" if mean >= 0 else f"({recorded} + {-mean!r})",
         "zero_of_driver": repr(zero_of(term.driver.units[0])) if term.driver.units[0] else names.get("zero", "0.0"),

@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.model.term import Driver, Drivers, Term, find_drivers, 
 from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Shape
+from mkc_torch.effects.kinds import kind_of
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.ports import Change, Nearby, Port, SignalSizes
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
@@ -156,7 +157,10 @@ def reach_of(term: Term, prepared: PreparedSimulation) -> dict[str, tuple[float,
 
 
 def _drives(driver: Driver, effect: Effect) -> bool:
-    """Whether a driver has one of an effect's roles; a curve without a name accepts any single column."""
+    """Whether a driver has one of an effect's roles and kinds; a curve without a name accepts any single column."""
+    kinds = effect.driver_kinds
+    if kinds and kind_of(driver.units[0], driver.columns[0]) not in kinds:
+        return False
     return driver.role in effect.roles or (bool(effect.roles) and effect.is_curve and len(driver.columns) == 1)
 
 

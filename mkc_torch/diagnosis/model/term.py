@@ -29,7 +29,6 @@ ANY = "any"
 """The role of a column of unknown role."""
 
 _ROLE_OF_NAME: Mapping[str, str] = {"temperature": "temperature", "temp": "temperature", "current": "current"}
-_ROLE_OF_LAST: Mapping[str, str] = {"temperature": "temperature", "temp": "temperature"}
 _ROLE_OF_UNIT: Mapping[str, str] = {"°C": "temperature", "K": "temperature", "A": "current"}
 _POSITION = ("position_x", "position_y", "position_z")
 
@@ -122,16 +121,13 @@ def _driver(
 
 
 def role_of(name: str, unit: str) -> str:
-    """Return the role of a column by its name's first word, else by its unit, else by a last word "temperature".
+    """Return the role of a column by its name's first word, else by its unit.
 
     Example:
         >>> role_of("temperature", "°C"), role_of("esc_power", "A"), role_of("current_3", ""), role_of("rpm", "")
         ('temperature', 'current', 'current', 'any')
-        >>> role_of("cell_temperature", "")
-        'temperature'
     """
-    words = name.lower().split("_")
-    return _ROLE_OF_NAME.get(words[0]) or _ROLE_OF_UNIT.get(unit) or _ROLE_OF_LAST.get(words[-1], ANY)
+    return _ROLE_OF_NAME.get(name.lower().split("_")[0]) or _ROLE_OF_UNIT.get(unit, ANY)
 
 
 def _own_role(name: str, roles: frozenset[str]) -> str:
