@@ -120,7 +120,7 @@ class Port:
             >>> Port(("u",), "V", kind="input").in_series("input u"), Port(("v",), "m/s²").in_series("rate of v")
             (True, False)
         """
-        return (self.kind or name) in ("input", "output", "outputs", "parameter")
+        return (self.kind or name) in ("input", "output", "outputs", "single output", "parameter")
 
     def at(self, values: Float[Tensor, N * rest]) -> Float[Tensor, G * rest]:
         """Values of the samples, interpolated to the moments of this port's signal."""

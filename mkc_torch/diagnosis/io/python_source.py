@@ -70,11 +70,13 @@ def python_source(
     inputs: list[str] = []
     outputs: list[str] = []
     varied: list[str] = []
+    single: list[str] = []
     for number in in_order_of_the_chain(terms, range(len(terms))):
         term, gamma = terms[number], gammas[number]
         lines = _lines(term, [_rounded(float(value)) for value in gamma], system, measured)
         kind_of_port = term.port.partition(" ")[0]
         place = {"output": outputs, "input": inputs, "parameter": varied}.get(kind_of_port, rates)
+        place = single if term.port.startswith("output ") else place
         if place is outputs and outputs:
             place.append("y = dict(shown)")  # the next effect acts on these outputs
         place += [f"# {term.effect.id}: {term.effect.equation}", *lines]
@@ -90,6 +92,7 @@ def python_source(
         *_hold(system, holds),
         *_states(system, memories, theta),
         *_varied(varied),
+        *_output(single, varied),
         *_actuator(inputs, varied if kind.actuator is not Dynamics.actuator else []),
         *_derivative(memories, rates, varied),
         *_sensor(outputs),
@@ -178,18 +181,20 @@ def _states(system: Dynamics, memories: Mapping[str, str], theta: Sequence[float
 
 
 def _varied(varied: list[str]) -> list[str]:
-    """Return the method of the parameters that effects change, and the output with them."""
+    """Return the method of the parameters that effects change."""
     if not varied:
         return []
     lines = ["p = SimpleNamespace(**vars(p))", *varied, "return p"]
-    return [
-        "",
-        "    def varied(self, u, p):",
-        *(f"        {line}" for line in lines),
-        "",
-        "    def output(self, time, x, u, p):",
-        "        return super().output(time, x, u, self.varied(u, p))",
-    ]
+    return ["", "    def varied(self, u, p):", *(f"        {line}" for line in lines)]
+
+
+def _output(single: list[str], varied: list[str]) -> list[str]:
+    """Return the method of the outputs, with effects on parameters and on single outputs."""
+    if not single and not varied:
+        return []
+    plain = f"super().output(time, x, u, {'self.varied(u, p)' if varied else 'p'})"
+    lines = [f"shown = dict({plain})", *single, "return shown"] if single else [f"return {plain}"]
+    return ["", "    def output(self, time, x, u, p):", *(f"        {line}" for line in lines)]
 
 
 def _actuator(inputs: list[str], varied: list[str]) -> list[str]:
@@ -260,6 +265,9 @@ def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Seque
     elif term.port.startswith("input "):
         name = term.port.removeprefix("input ")
         targets, names = [f"acting.{name}"], {"own": f"acting.{name}"}
+    elif term.port.startswith("output "):
+        name = term.port.removeprefix("output ")
+        targets, names = [f'shown["{name}"]'], {"own": f'shown["{name}"]'}
     elif term.port.startswith("parameter "):
         name = term.port.removeprefix("parameter ")
         targets, names = [f"p.{name}"], {"own": f"p.{name}"}

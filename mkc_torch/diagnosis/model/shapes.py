@@ -76,7 +76,7 @@ def candidate_terms(
             Term(effect, driver, shape, "" if at == effect.port else at)
             for at in places
             for driver in fitting
-            if driver is None or driver.columns in own or prepared.ports[at].clock is None
+            if driver is None or driver.columns in own or prepared.dynamics is None
             for shape in (absolute(effect, shape, prepared.ports[at], driver) for shape in shapes)
         ]
     return tuple(term for term in terms if not within_a_sample(term, prepared))

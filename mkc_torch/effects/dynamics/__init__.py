@@ -15,6 +15,9 @@ from mkc_torch.effects.dynamics.dead_zone import DeadZone
 from mkc_torch.effects.dynamics.driver_exchange import DriverExchange
 from mkc_torch.effects.dynamics.driver_force import DriverForce
 from mkc_torch.effects.dynamics.driver_input_gain import DriverInputGain
+from mkc_torch.effects.dynamics.driver_output import DriverOutput
+from mkc_torch.effects.dynamics.driver_output_lagged import DriverOutputLagged
+from mkc_torch.effects.dynamics.driver_output_quadratic import DriverOutputQuadratic
 from mkc_torch.effects.dynamics.driver_parameter import DriverParameter
 from mkc_torch.effects.dynamics.driver_parameter_arrhenius import DriverParameterArrhenius
 from mkc_torch.effects.dynamics.driver_parameter_quadratic import DriverParameterQuadratic
@@ -82,6 +85,9 @@ DYNAMICS: tuple[Effect, ...] = (
     DriverParameterQuadratic(),
     DriverParameterArrhenius(),
     Backlash(),
+    DriverOutput(),
+    DriverOutputQuadratic(),
+    DriverOutputLagged(),
     SensorLag(),
     UnknownRate("difference"),
     UnknownRate("own"),

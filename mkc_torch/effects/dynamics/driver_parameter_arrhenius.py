@@ -54,10 +54,7 @@ class DriverParameterArrhenius(Effect):
 
     def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
         exponent = -gamma[0] * _absolute_mean(context) ** 2
-        return (
-            f"{slope_in_words(gamma[0], context)} at its mean, by Arrhenius' law, "
-            f"exp({exponent:.4g} K (1/T − 1/T̄))."
-        )
+        return f"{slope_in_words(gamma[0], context)} at its mean, by Arrhenius' law, exp({exponent:.4g} K (1/T − 1/T̄))."
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
         share = f"{names['driver']} * {names['absolute_mean']} / ({names['absolute_mean']} + {names['driver']})"

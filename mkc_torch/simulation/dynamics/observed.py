@@ -12,6 +12,7 @@ from torch import Tensor
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observer, ObserverJump
+from mkc_torch.simulation.dynamics.single_outputs import with_changes
 from mkc_torch.simulation.dynamics.user_functions import namespace
 from mkc_torch.simulation.dynamics.varying import Acting, varied
 from mkc_torch.simulation.names import Names
@@ -195,7 +196,7 @@ class ObservedDynamics:
         n, extra = len(self.system.states), len(self.lasting)
         memories = sum(len(memory) for memory in self.remembering(changes).values())
         places = (*range(n), *range(n + memories, n + memories + extra))
-        by_states = self.predicted(self.acting_at_samples(theta, changes) if acting is None else acting)
+        by_states = self.predicted(self.acting_at_samples(theta, changes) if acting is None else acting, changes)
 
         def predict(states: Tensor) -> Tensor:
             return by_states(states) + self.output_disturbance(states)
@@ -211,13 +212,14 @@ class ObservedDynamics:
             made = made + changes["output"](self.clean + made)
         return self.measured - made
 
-    def predicted(self, acting: Acting) -> Callable[[Tensor], Tensor]:
-        """The function from the states at the samples to the outputs there, before the sensors."""
+    def predicted(self, acting: Acting, changes: Changes) -> Callable[[Tensor], Tensor]:
+        """The function from the states at the samples to the outputs there, with effects, before the sensors."""
         n, p = len(self.system.states), acting.parameters
         u = namespace(self.system.inputs, acting.inputs)
 
         def outputs(states: Tensor) -> Tensor:
-            values = self.system.output(self.time, namespace(self.system.states, states[:, :n]), u, p)
+            plain = self.system.output(self.time, namespace(self.system.states, states[:, :n]), u, p)
+            values = with_changes(plain, changes, states[:, 0])
             return torch.stack([values[name] + torch.zeros_like(states[:, 0]) for name in self.channels], -1)
 
         return outputs

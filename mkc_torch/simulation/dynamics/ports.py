@@ -113,6 +113,17 @@ class PortContext:
                 clock=self.clock,
                 run=self.run[self.clock.before],
             )
+        for name in self.channels:
+            unit = self._unit_of(name)
+            places[f"output {name}"] = Port(
+                (name,),
+                unit,
+                pointwise=False,
+                kind="single output",
+                parts={"own": name},
+                part_units={"own": unit},
+                run=self.run,
+            )
         parts = {"own": self.channels[0], **{f"output {name}": name for name in self.channels[1:]}}
         units = {part: self._unit_of(name) for part, name in parts.items()}
         unit = common_unit(self._unit_of(name) for name in self.channels)

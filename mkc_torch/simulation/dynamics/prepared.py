@@ -30,6 +30,7 @@ from mkc_torch.simulation.dynamics.ports import RATES, PortContext, common_unit
 from mkc_torch.simulation.dynamics.refinement import FINEST, enough_parts
 from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
 from mkc_torch.simulation.dynamics.settings import HORIZON
+from mkc_torch.simulation.dynamics.single_outputs import with_changes
 from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory, marched, solve, stations
 from mkc_torch.simulation.dynamics.user_functions import kinematic, namespace
 from mkc_torch.simulation.dynamics.varying import Acting
@@ -271,7 +272,7 @@ class PreparedDynamics(ObservedDynamics):
 
         ``acting`` are the acting inputs and parameters at the samples if they are known.
         """
-        outputs = self._outputs(self.acting_at_samples(theta, changes) if acting is None else acting, states)
+        outputs = self._outputs(self.acting_at_samples(theta, changes) if acting is None else acting, changes, states)
         if "output" in changes:
             outputs = outputs + changes["output"](outputs)
         return outputs + self.output_disturbance(states)
@@ -282,7 +283,8 @@ class PreparedDynamics(ObservedDynamics):
         jump = self.jump(theta, changes)
         at_stations = stations(self.rate(theta, changes, acting), found.states, self.grid.step.unsqueeze(-1), jump)
         at_stations = at_stations[:, : len(self.system.states)]
-        outputs = self._outputs(self.acting_at_samples(theta, changes), found.states[self.rows])
+        here, at_samples = self.acting_at_samples(theta, changes), found.states[self.rows]
+        outputs, plain = self._outputs(here, changes, at_samples), self.predicted(here, {})(at_samples)
         rates = self._rates(acting, at_stations)
         at = {
             name: self._signal(port, acting, at_stations, rates)
@@ -294,6 +296,7 @@ class PreparedDynamics(ObservedDynamics):
         p = self.parameters_of(theta)
         varying = [port.channels[0] for port in self.ports.values() if port.kind == "parameter"]
         at |= {f"parameter {name}": getattr(p, name) + still for name in varying}
+        at |= {f"output {name}": plain[:, [k]] for k, name in enumerate(self.channels)}
         return at | {"output": outputs}
 
     def trajectory(
@@ -397,11 +400,12 @@ class PreparedDynamics(ObservedDynamics):
         values = [found[s] for s in self.system.states] if isinstance(found, Mapping) else list(found)
         return [v + torch.zeros_like(states[:, 0]) for v in values]
 
-    def _outputs(self, acting: Acting, states: Float[Tensor, "N w"]) -> Float[Tensor, "N m"]:
+    def _outputs(self, acting: Acting, changes: Changes, states: Float[Tensor, "N w"]) -> Float[Tensor, "N m"]:
         inputs, p = acting
         x = namespace(self.system.states, states[:, : len(self.system.states)])
         u = namespace(self.system.inputs, inputs)
-        values = self.system.sensor(self.time, self.system.output(self.time, x, u, p), p, self.run)
+        y = with_changes(self.system.output(self.time, x, u, p), changes, states[:, 0])
+        values = self.system.sensor(self.time, y, p, self.run)
         return torch.stack([values[name] for name in self.channels], -1)
 
     def _check_functions(self) -> None:
