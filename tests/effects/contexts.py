@@ -37,7 +37,7 @@ def dynamic_context(effect, N=80, driven=False):
     drivers, driver_units, means = time.new_zeros(N, 0), (), ()
     if driven or needs_driver(effect):
         drivers, driver_units, means = torch.cos(3.0 * time).unsqueeze(-1), UNITS[effect.roles[0]], (2.0,)
-    if effect.port in ("input", "output"):
+    if effect.port in ("input", "output", "single output"):
         parts, units = {"own": "force"}, {"own": "N"}
         signal = oscillating(N, 1)
         return Context(time, drivers, driver_units, signal, "N", ("force",), (), parts, units, None, means)

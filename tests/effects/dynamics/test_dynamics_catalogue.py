@@ -65,9 +65,10 @@ def test_effects_on_equations_depend_on_states_inputs_or_columns():
     assert driven == {
         "driver_force", "driver_exchange", "driver_rate_constant", "driver_input_gain",
         "driver_parameter", "driver_parameter_quadratic", "driver_parameter_arrhenius",
+        "driver_output", "driver_output_quadratic", "driver_output_lagged",
     }  # fmt: skip
     for effect in DYNAMICS:
-        assert effect.follows_signal
+        assert effect.follows_signal != effect.id.startswith("driver_output")
         assert all(low > 0.0 for low, _ in effect.fitted_shape.values())
         assert effect.plot_axis in ("", *dynamic_context(effect).parts)
         assert effect.equation.startswith("δ")
@@ -425,7 +426,12 @@ class TestNeeds:
         class Pieces(Pendulum):
             restart_after = 2.0
 
-        assert set(prepared(Pieces, angle=torch.cos(3.0 * TIME)).ports) == {"rate of speed", "parameter stiffness", "output"}
+        assert set(prepared(Pieces, angle=torch.cos(3.0 * TIME)).ports) == {
+            "rate of speed",
+            "parameter stiffness",
+            "output angle",
+            "output",
+        }
 
     def test_effects_tried_on_two_bodies_are_thermal(self):
         decay = torch.exp(-0.1 * TIME)
