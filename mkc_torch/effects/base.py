@@ -62,6 +62,8 @@ class Effect(ABC):
             empty: it depends on time or the signal only.
         driver_kinds: kinds of quantity of these columns, by unit or name, see :mod:`mkc_torch.effects.kinds`; default
             empty: any kind.
+        positive_driver: whether these columns must nowhere be negative, as a flow; default False.
+        driven_by_inputs: whether other inputs of the simulation drive it as columns do; default False.
         driver_optional: whether an effect with roles is also tried without a driver; default False.
         follows_signal: whether its change depends on the signal at its port; default False.
         location_specific: whether it belongs to the place or the attitude of its recording and does not transfer to
@@ -132,6 +134,8 @@ class Effect(ABC):
     reduces_to: Effect | None = None
     roles: tuple[str, ...] = ()
     driver_kinds: tuple[Kind, ...] = ()
+    positive_driver: bool = False
+    driven_by_inputs: bool = False
     driver_optional: bool = False
     follows_signal: bool = False
     location_specific: bool = False

@@ -32,6 +32,7 @@ _FROM_HERE: Mapping[str, str] = {
     "shifted(": "from mkc_torch.effects import shifted",
     "soft_clip(": "from mkc_torch.effects import soft_clip",
     "curve_within(": "from mkc_torch.effects import curve_within",
+    "travelled(": "from mkc_torch.effects import travelled",
     "beyond(": "from mkc_torch.effects import beyond",
     "SimpleNamespace(": "from types import SimpleNamespace",
     "Parameter(": "from mkc_torch.simulation import Parameter",
@@ -308,6 +309,7 @@ def _driver_names(term: Term, names: Mapping[str, str]) -> dict[str, str]:
     absolute = absolute_zero(term.driver.units[0], mean)
     return {
         "recorded": recorded,
+        "mean": repr(mean),
         "absolute_mean": repr(_rounded(mean + absolute)),
         "driver": f"({recorded} - {mean!r})" if mean >= 0 else f"({recorded} + {-mean!r})",
         "zero_of_driver": repr(zero_of(term.driver.units[0])) if term.driver.units[0] else names.get("zero", "0.0"),

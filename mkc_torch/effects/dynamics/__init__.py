@@ -29,6 +29,7 @@ from mkc_torch.effects.dynamics.input_delay import InputDelay
 from mkc_torch.effects.dynamics.input_lag import InputLag
 from mkc_torch.effects.dynamics.input_saturation import InputSaturation
 from mkc_torch.effects.dynamics.input_square import InputSquare
+from mkc_torch.effects.dynamics.input_transport_delay import InputTransportDelay
 from mkc_torch.effects.dynamics.linear_drag import LinearDrag
 from mkc_torch.effects.dynamics.load_dependent_friction import LoadDependentFriction
 from mkc_torch.effects.dynamics.magnus_lift import MagnusLift
@@ -76,6 +77,7 @@ DYNAMICS: tuple[Effect, ...] = (
     ThermalLoss(to_surroundings=True),
     ThermalLoss(),
     InputDelay(),
+    InputTransportDelay(),
     InputLag(),
     InputSquare(),
     InputSaturation(),

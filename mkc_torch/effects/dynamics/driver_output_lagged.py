@@ -43,7 +43,7 @@ class DriverOutputLagged(DriverOutput):
         return tuple({"lag": share * length} for share in SHARES)
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
-        return lagged(context.drivers[:, 0], context.time, shape["lag"], context.runs)
+        return lagged(context.drivers[:, 0], context.time, shape.get("lag", 0.0), context.runs)
 
     def code(self, gamma: Sequence[float], shape: Shape, names: Mapping[str, str]) -> tuple[str, ...]:
         return (f"{gamma[0]!r} * lagged({names['driver']}, time, {shape['lag']!r})",)
