@@ -94,7 +94,7 @@ def python_source(
         *_states(system, memories, theta),
         *_varied(varied),
         *_output(single, varied),
-        *_actuator(inputs, varied if kind.actuator is not Dynamics.actuator else []),
+        *_actuator(inputs, varied, own=kind.actuator is not Dynamics.actuator, columns=bool(_inputs(system, terms))),
         *_derivative(memories, rates, varied),
         *_sensor(outputs),
     ]
@@ -198,12 +198,21 @@ def _output(single: list[str], varied: list[str]) -> list[str]:
     return ["", "    def output(self, time, x, u, p):", *(f"        {line}" for line in lines)]
 
 
-def _actuator(inputs: list[str], varied: list[str]) -> list[str]:
-    if not inputs and not varied:
+def _actuator(inputs: list[str], varied: list[str], *, own: bool, columns: bool) -> list[str]:
+    """Return the method of the acting inputs.
+
+    Args:
+        inputs, varied: lines of the effects on inputs and on parameters.
+        own: whether the class has an actuator of its own, which may depend on parameters.
+        columns: whether there are new inputs, which it would not return.
+    """
+    if not inputs and not (own and (varied or columns)):
         return []
     p = "self.varied(u, p)" if varied else "p"
+    u = "acting" if inputs else "u"
     acting = ["acting = SimpleNamespace(**vars(u))", *inputs] if inputs else []
-    lines = [*acting, f"return super().actuator(time, {'acting' if inputs else 'u'}, {p}, run)"]
+    found = f"super().actuator(time, {u}, {p}, run)"
+    lines = [*acting, f"return {{**vars({u}), **{found}}}" if own and columns else f"return {found}"]
     return ["", "    def actuator(self, time, u, p, run):", *(f"        {line}" for line in lines)]
 
 
