@@ -204,7 +204,10 @@ def _longest_run(prepared: PreparedSimulation) -> float:
 
 
 def special_cases(term: Term, terms: Sequence[Term], prepared: PreparedSimulation) -> list[Term]:
-    """Return the candidates that are a special case of an effect, or that it is one of, at the same channels."""
+    """Return the candidates that are a special case of an effect, or that it is one of, at the same channels.
+
+    Of a dependence on a column also its other forms, which have the same special case.
+    """
     channels = prepared.ports[term.port].channels
     found = []
     for other in terms:
@@ -212,10 +215,16 @@ def special_cases(term: Term, terms: Sequence[Term], prepared: PreparedSimulatio
         nested = any(
             general.reduces_to is not None and general.reduces_to.id == special.id for general, special in pair
         )
+        if comes_by_exchange(term) and comes_by_exchange(other) and other.effect.id != term.effect.id:
+            nested = nested or _special_id(other) == _special_id(term)
         alike = other.columns == term.columns or not (other.columns and term.columns)
         if nested and prepared.ports[other.port].channels == channels and alike:
             found.append(other)
     return found
+
+
+def _special_id(term: Term) -> str:
+    return term.effect.reduces_to.id if term.effect.reduces_to is not None else ""
 
 
 def comes_by_exchange(term: Term) -> bool:

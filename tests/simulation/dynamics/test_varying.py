@@ -116,18 +116,19 @@ def test_a_parameter_that_depends_on_a_column_equals_an_exact_integration(form, 
     torch.testing.assert_close(compiled.tangents(theta, answer.nearby)[0].movedim(0, -1), slopes, rtol=0.0, atol=1e-8)
 
 
-@pytest.mark.parametrize("form", [*FORMS, "driver_output", "driver_output_quadratic", "driver_output_lagged"])
+EXPORTED = (*FORMS, "driver_output", "driver_output_quadratic", "driver_output_lagged", "input_transport_delay")
+
+
+@pytest.mark.parametrize("form", EXPORTED)
 def test_the_exported_class_has_the_residual_of_the_model(form):
-    table = recording()
+    table = recording(flow=2.0 + np.cos(0.7 * TIME))
     prepared, terms = terms_at(Circuit(), table, form)
     by_port = {term.port: term for term in terms}  # the last shape of each
     joint = JointModel(prepared, list(by_port.values()))
     theta = torch.tensor([0.45, 0.3, 1.1, 0.2], dtype=torch.float64)
     gammas = [torch.linspace(0.02, 0.01, size, dtype=torch.float64) for size in joint.sizes]
-    text = DiagnosedModel("Circuit", prepared.state, theta, list(by_port.values()), gammas, Circuit()).to_python(
-        "known"
-    )
-    known = {"Circuit": Circuit}
+    model = DiagnosedModel("Circuit", prepared.state, theta, list(by_port.values()), gammas, Circuit())
+    text, known = model.to_python("known"), {"Circuit": Circuit}
     exec(text.replace("from known import Circuit", ""), known)
     again = known["CorrectedCircuit"]().prepare(table)
     with_it = joint.residual(torch.cat([theta, *gammas]))
@@ -178,10 +179,8 @@ def test_arrhenius_law_is_tried_for_temperatures_only():
 def test_arrhenius_law_uses_the_absolute_temperature(unit, zero):
     prepared, (term, *_) = terms_at(Circuit(), recording(), "driver_parameter_arrhenius")
     signal = torch.full((len(prepared.clock.time), 1), 2.0, dtype=torch.float64)
-    driver = replace(term.driver, units=(unit,))
-    change = term.effect.change(
-        torch.tensor([0.03], dtype=torch.float64), {}, replace(term, driver=driver).context(prepared, signal)
-    )
+    context = replace(term, driver=replace(term.driver, units=(unit,))).context(prepared, signal)
+    change = term.effect.change(torch.tensor([0.03], dtype=torch.float64), {}, context)
     column, mean = np.interp(prepared.clock.time, TIME, COLUMN) + zero, COLUMN.mean() + zero
     expected = 2.0 * (np.exp(-0.03 * mean**2 * (1.0 / column - 1.0 / mean)) - 1.0)
     torch.testing.assert_close(change[:, 0], torch.as_tensor(expected), rtol=1e-9, atol=1e-9)
