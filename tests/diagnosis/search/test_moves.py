@@ -236,15 +236,12 @@ def test_forms_of_a_dependence_on_a_column_are_exchanged_for_one_another():
 def test_one_form_of_a_dependence_is_added(gains, chosen):
     _, terms = strip_terms()
     names = ("driver_parameter", "driver_parameter_quadratic", "driver_parameter_arrhenius")
-    found = [
-        Addition(
-            (([t for t in terms if t.effect.id == name and t.columns == ("temperature",)][0], torch.zeros(1)),), gain
-        )
-        for name, gain in zip(names, gains, strict=True)
-        if gain is not None
-    ]
-    delay = Addition((([t for t in terms if t.effect.id == "input_transport_delay"][0], torch.zeros(1)),), 99.0)
-    kept = one_form_each([*found, delay], lambda addition: addition.gain)
+    worth = {name: gain for name, gain in zip(names, gains, strict=True) if gain is not None}
+    worth["input_transport_delay"] = 99.0  # without its special case among the additions
+    columns = {name: ("flow",) if name == "input_transport_delay" else ("temperature",) for name in worth}
+    first = {name: next(t for t in terms if (t.effect.id, t.columns) == (name, columns[name])) for name in worth}
+    found = [Addition(((first[name], torch.zeros(1)),), gain) for name, gain in worth.items()]
+    kept = one_form_each(found, lambda addition: addition.gain)
     assert {addition.starts[0][0].effect.id for addition in kept} == chosen
 
 
