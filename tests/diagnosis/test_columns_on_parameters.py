@@ -65,7 +65,10 @@ def table(rng, columns, output, values, noise):
     error = noise * rng.normal(size=N)
     error[rng.random(N) < 0.02] += 8.0 * noise
     known = {**columns, output: values + error}
-    return Recording({k: torch.as_tensor(v) for k, v in known.items()}, units={"air_temperature": "°C"})
+    return Recording(
+        {k: torch.as_tensor(v) for k, v in known.items()},
+        units={"air_temperature": "°C"} if "air_temperature" in known else {},
+    )
 
 
 def lagged(away, time, lag):

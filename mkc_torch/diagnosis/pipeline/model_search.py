@@ -44,6 +44,9 @@ Keep = Callable[[StepwiseSearch], object]
 _NEXT = 3
 """Models that are asked in turn if held-out blocks refuse the only effect of the best."""
 
+_SAME_SCORE = 0.1
+"""Nats within which the scores of two fits of the same physics are equal."""
+
 _QUICK_MODELS = 8
 """Largest number of models in a quick look."""
 
@@ -191,16 +194,43 @@ def _in_turn(beam: BeamSearch) -> list[list[Candidate]]:
     good = [model for model in ranked if model.value > alone.value]
     behind = beam.settings.naming.separable * beam.basis.kappa
     alike = [model for model in good if model.value >= good[0].value - behind]
-    for model in [*sorted(alike, key=_simplest), *good[len(alike) :]]:
+    for model in [*_by_price(alike, beam.terms), *good[len(alike) :]]:
         chain = _chain(model, beam)
         if all(later.value > earlier.value for earlier, later in itertools.pairwise([alone, *chain])):
             return [chain, *[other for other in single if other[0].key != chain[0].key]][:_NEXT]
     return single[:_NEXT]
 
 
-def _simplest(model: Candidate) -> tuple[float, int]:
-    """Order models by price, and at equal price by the number of effects that have a form to first order."""
-    return round(model.price, 6), sum(comes_by_exchange(term) for term in model.fit.model.terms)
+def _by_price(models: Sequence[Candidate], terms: Sequence[Term]) -> list[Candidate]:
+    """Order models by price, at equal price first those to first order in their columns, then by score.
+
+    The same dependence on a column can have two names, as a loss and as the parameter of this loss. Of models of equal
+    price and score with the same columns, the name that is first in the catalogue comes first.
+    """
+
+    def price(model: Candidate) -> tuple[float, int]:
+        return round(model.price, 6), sum(comes_by_exchange(term) for term in model.fit.model.terms)
+
+    def columns(model: Candidate) -> list[tuple[str, ...]]:
+        return sorted(term.columns for term in model.fit.model.terms)
+
+    def place(model: Candidate) -> list[int]:
+        own = {term.key for term in model.fit.model.terms}
+        return sorted(number for number, term in enumerate(terms) if term.key in own)
+
+    ordered = sorted(models, key=price)
+    for number, model in enumerate(ordered):
+        same = [
+            other
+            for other in ordered[number:]
+            if price(other) == price(model) and columns(other) == columns(model) and any(columns(model))
+            if abs(other.value - model.value) < _SAME_SCORE
+        ]
+        if same:
+            first = min(same, key=place)
+            ordered.remove(first)
+            ordered.insert(number, first)
+    return ordered
 
 
 def _named(models: Sequence[Candidate], alone: Candidate) -> list[Candidate]:
