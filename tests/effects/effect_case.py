@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.effects import Effect, beyond, curve_within, lagged, played, shifted, soft_clip
+from mkc_torch.effects import Effect, beyond, curve_within, lagged, played, shifted, soft_clip, travelled
 from mkc_torch.effects.kinds import absolute_zero
 from mkc_torch.effects.waveforms import outer_product
 from mkc_torch.simulation.dynamics.ports import memory_at
@@ -278,11 +278,12 @@ class OfEveryShape:
             means = context.driver_means or (0.0,)
             names |= {"recorded": "d", "driver": f"(d - {means[0]!r})"}
             names["zero_of_driver"] = "273.15" if context.units[0] == "°C" else "0.0"
+            names["mean"] = repr(means[0])
             names["absolute_mean"] = repr(means[0] + absolute_zero(context.units[0], means[0]))
         known = {"x": x, "torch": torch, "time": context.time, "run": context.runs}
         known |= {"d": context.recorded} if context.units else {}
         known |= {"lagged": lagged, "shifted": shifted, "played": played, "soft_clip": soft_clip, "beyond": beyond}
-        known["curve_within"] = curve_within
+        known |= {"curve_within": curve_within, "travelled": travelled}
         shape = {name: float(value) for name, value in shape.items()}
         lines = effect.code(gamma.tolist(), shape, names)
         written = torch.stack([eval(line, known) + torch.zeros_like(context.time) for line in lines], -1)

@@ -131,7 +131,7 @@ def test_optional_abilities_of_effects():
     assert {e.id for e in CATALOGUE if e.simpler} == {"coupling", "sensor_lag", "delay"}
     coulomb = dict.fromkeys(("stribeck_friction", "load_dependent_friction"), "coulomb_friction")
     linear = dict.fromkeys(("driver_parameter_quadratic", "driver_parameter_arrhenius"), "driver_parameter")
-    linear |= {"driver_output_quadratic": "driver_output"}
+    linear |= {"driver_output_quadratic": "driver_output", "input_transport_delay": "input_delay"}
     assert {e.id: e.reduces_to.id for e in CATALOGUE if e.reduces_to} == coulomb | linear
     assert {e.id for e in CATALOGUE if e.is_curve} == {"unknown"}
     assert {e.id for e in CATALOGUE if e.is_generalisation} == {

@@ -65,7 +65,7 @@ def test_effects_on_equations_depend_on_states_inputs_or_columns():
     assert driven == {
         "driver_force", "driver_exchange", "driver_rate_constant", "driver_input_gain",
         "driver_parameter", "driver_parameter_quadratic", "driver_parameter_arrhenius",
-        "driver_output", "driver_output_quadratic", "driver_output_lagged",
+        "driver_output", "driver_output_quadratic", "driver_output_lagged", "input_transport_delay",
     }  # fmt: skip
     for effect in DYNAMICS:
         assert effect.follows_signal != effect.id.startswith("driver_output")
