@@ -275,6 +275,8 @@ def _flow(fit: FittedModel) -> Flow | None:
 def is_implausible(fit: FittedModel, basis: ScoreBasis) -> bool:
     """Whether an effect changes a rate by far more than the rates of the recording, so that two changes cancel.
 
+    Or whether effects take a parameter out of its bounds for more than a tenth of the recording.
+
     Args:
         fit: the model.
         basis: with the largest rates of the recording.
@@ -285,6 +287,11 @@ def is_implausible(fit: FittedModel, basis: ScoreBasis) -> bool:
     assert prepared is not None
     largest = dict(zip(prepared.disturbable, basis.largest, strict=False))
     signals = model.signals(fit.parameters)
+    for name in {term.port for term in model.terms if prepared.ports[term.port].kind == "parameter"}:
+        known = prepared.known[prepared.ports[name].channels[0]]
+        value = (signals[name] + model.changes(fit.parameters)[name](signals[name])).detach()
+        if float(((value < known.lower) | (value > known.upper)).double().mean()) > 1.0 - _USUAL:
+            return True
     for term, gamma in zip(model.terms, model.gammas(fit.parameters), strict=True):
         port = prepared.ports[term.port]
         if port.kind not in (*RATES, ENTRY):

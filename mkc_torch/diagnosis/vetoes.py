@@ -6,6 +6,7 @@ A veto compares a number of the finding with a threshold. It only grades: it nei
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -209,7 +210,7 @@ def spelled(finding: Finding) -> str:
         >>> spelled(Finding("linear_drag", (), ("rate of speed",), (), None, "", "", (), 0.01, (), True, ""))
         'linear_drag@speed'
     """
-    places = [name.removeprefix("rate of ").removeprefix("input ") for name in finding.channels]
+    places = [re.sub("^(rate of|input|parameter) ", "", name) for name in finding.channels]
     return "@".join(filter(None, [finding.effect, ",".join(finding.drivers or places)]))
 
 

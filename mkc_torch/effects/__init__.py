@@ -15,6 +15,7 @@ from __future__ import annotations
 from mkc_torch.effects.base import Effect, GainEffect, in_words
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.dynamics import DYNAMICS
+from mkc_torch.effects.dynamics.input_transport_delay import travelled
 from mkc_torch.effects.dynamics.rate import beyond
 from mkc_torch.effects.dynamics.unknown_near_ends import curve_within
 from mkc_torch.effects.kinds import kind_of
@@ -52,6 +53,7 @@ __all__ = [
     "shifted",
     "since_start",
     "soft_clip",
+    "travelled",
     "words_of",
 ]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NoReturn
 from torch import Tensor
 
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.kinds import kind_at
+from mkc_torch.effects.kinds import Kind, kind_at
 from mkc_torch.effects.waveforms import outer_product, per
 
 if TYPE_CHECKING:
@@ -60,6 +60,10 @@ class Effect(ABC):
         excludes: parts that such a port must not have, because another form of the effect covers them; default none.
         roles: roles of the columns that drive it, as :mod:`mkc_torch.diagnosis.model.term` assigns them; default
             empty: it depends on time or the signal only.
+        driver_kinds: kinds of quantity of these columns, by unit or name, see :mod:`mkc_torch.effects.kinds`; default
+            empty: any kind.
+        positive_driver: whether these columns must nowhere be negative, as a flow; default False.
+        driven_by_inputs: whether other inputs of the simulation drive it as columns do; default False.
         driver_optional: whether an effect with roles is also tried without a driver; default False.
         follows_signal: whether its change depends on the signal at its port; default False.
         location_specific: whether it belongs to the place or the attitude of its recording and does not transfer to
@@ -92,8 +96,8 @@ class Effect(ABC):
         shape_units: name of a shape parameter to its unit, for those whose unit does not depend on the recording;
             default s for onset, lag, delay and time_constant.
         plot_axis: part of the signal over which its curve is drawn; default none.
-        reduces_to: a special case of this effect with fewer numbers, whose shape is a part of this effect's shape;
-            default None.
+        reduces_to: a special case of this effect, or its form to first order, with no more numbers, whose shape is a
+            part of this effect's shape; default None.
         simpler: the same physics with fewer numbers in γ, each shared by several consecutive numbers of this effect's
             γ, and with the same shapes. It is preferred where it predicts unseen blocks as well. Default None.
 
@@ -129,6 +133,9 @@ class Effect(ABC):
     excludes: tuple[str, ...] = ()
     reduces_to: Effect | None = None
     roles: tuple[str, ...] = ()
+    driver_kinds: tuple[Kind, ...] = ()
+    positive_driver: bool = False
+    driven_by_inputs: bool = False
     driver_optional: bool = False
     follows_signal: bool = False
     location_specific: bool = False

@@ -36,6 +36,7 @@ class Context:
         part_units: units of the parts.
         run: (N,), number of each sample's run; None where the simulation has no runs.
         driver_means: means that were subtracted from the drivers.
+        columns: names of the drivers.
 
     Example:
         >>> import torch
@@ -58,6 +59,7 @@ class Context:
     part_units: Mapping[str, str] = field(default_factory=dict)
     run: Int[Tensor, " N"] | None = None
     driver_means: tuple[float, ...] = ()
+    columns: tuple[str, ...] = ()
 
     @property
     def recorded(self) -> Float[Tensor, " N"]:

@@ -15,6 +15,12 @@ MOTION: tuple[Kind, ...] = ("angle", "rotation", "position", "speed")
 CELSIUS = ("°C", "degC", "deg_C", "celsius", "Celsius")
 """Ways to write degrees Celsius."""
 
+_FAHRENHEIT = ("°F", "degF")
+"""Ways to write degrees Fahrenheit."""
+
+_LEAST_KELVIN = 150.0
+"""Mean above which a temperature without a unit is in K."""
+
 _JOINTS = "angle base elbow flex hip joint knee lift pan pitch roll shoulder tilt wrist yaw"
 """Words in the names of joint angles."""
 
@@ -70,6 +76,20 @@ def kind_at(context: Context) -> Kind:
     name = context.parts.get("own", context.channels[0] if context.channels else "")
     kind = kind_of(context.part_units.get("own", context.signal_unit), name)
     return "level" if kind == "position" and "level" in context.parts else kind
+
+
+def absolute_zero(unit: str, mean: float) -> float:
+    """The offset that makes a temperature with this mean absolute; °F becomes absolute in degrees Rankine.
+
+    Without a unit a temperature is in °C if its mean is below 150, otherwise in K.
+
+    Example:
+        >>> absolute_zero("K", 20.0), absolute_zero("", 20.0), absolute_zero("", 300.0), absolute_zero("°F", 70.0)
+        (0.0, 273.15, 0.0, 459.67)
+    """
+    if unit in _FAHRENHEIT:
+        return 459.67
+    return zero_of(unit) if unit else 273.15 * (mean < _LEAST_KELVIN)
 
 
 def zero_of(unit: str) -> float:

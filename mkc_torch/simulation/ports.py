@@ -115,13 +115,14 @@ class Port:
     def in_series(self, name: str) -> bool:
         """Whether effects at this port, named ``name``, act in series, each on the output of the previous effect.
 
-        Effects on an input or an output are in a signal chain; forces on a rate add up.
+        Effects on an input or an output are in a signal chain, those on a parameter are factors; forces on a rate add
+        up.
 
         Example:
             >>> Port(("u",), "V", kind="input").in_series("input u"), Port(("v",), "m/s²").in_series("rate of v")
             (True, False)
         """
-        return (self.kind or name) in ("input", "output", "outputs")
+        return (self.kind or name) in ("input", "output", "outputs", "single output", "parameter")
 
     def at(self, values: Float[Tensor, N * rest]) -> Float[Tensor, G * rest]:
         """Values of the samples, interpolated to the moments of this port's signal."""

@@ -15,7 +15,8 @@ from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise
 from mkc_torch.diagnosis.model.shapes import candidate_terms
-from mkc_torch.diagnosis.score import ScoreBasis, basis_of, highest, score, variance_ratio
+from mkc_torch.diagnosis.model.term import find_drivers
+from mkc_torch.diagnosis.score import ScoreBasis, basis_of, highest, is_implausible, score, variance_ratio
 from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Dynamics, Parameter
@@ -184,6 +185,22 @@ def test_an_implausible_size_has_no_score() -> None:
     smaller = replace(basis, largest=1e-4 * basis.largest)
     assert score(friction, basis, Settings()) is not None
     assert score(friction, smaller, Settings()) is None
+
+
+@pytest.mark.parametrize(("size", "possible"), [(0.5, True), (3.0, False)])
+def test_a_parameter_that_an_effect_takes_out_of_its_bounds_has_no_score(size: float, possible: bool) -> None:
+    known = recorded(0)
+    wave = torch.linspace(0.0, 30.0, len(known), dtype=torch.float64).sin()
+    recording = Recording({**known.columns, "heat": wave})
+    prepared = Slide().prepare(recording)
+    driver = find_drivers(prepared.recording, Slide().columns, Settings().drivers).drivers
+    (effect,) = [effect for effect in CATALOGUE if effect.id == "driver_parameter"]
+    (term,) = [term for term in candidate_terms(prepared, driver, [effect]) if term.port == "parameter damping"]
+    alone = fitted(JointModel(prepared), prepared.start())
+    basis = basis_of(alone, 10, {}, Settings())
+    model = JointModel(prepared, [term])
+    parameters = torch.cat([alone.parameters, alone.parameters.new_tensor([size])])
+    assert is_implausible(replace(alone, model=model, parameters=parameters), basis) is not possible
 
 
 def test_the_variance_ratio_of_overlapping_sums_is_their_length() -> None:

@@ -37,10 +37,14 @@ def dynamic_context(effect, N=80, driven=False):
     drivers, driver_units, means = time.new_zeros(N, 0), (), ()
     if driven or needs_driver(effect):
         drivers, driver_units, means = torch.cos(3.0 * time).unsqueeze(-1), UNITS[effect.roles[0]], (2.0,)
-    if effect.port in ("input", "output"):
+    if effect.port in ("input", "output", "single output"):
         parts, units = {"own": "force"}, {"own": "N"}
         signal = oscillating(N, 1)
         return Context(time, drivers, driver_units, signal, "N", ("force",), (), parts, units, None, means)
+    if effect.port == "parameter":
+        signal = time.new_full((N, 1), 1.7)
+        parts, units = {"own": "drag"}, {"own": "1/m"}
+        return Context(time, drivers, driver_units, signal, "1/m", ("drag",), (), parts, units, None, means)
     names = ("angle", "speed", "other", "load", "rate")
     parts = {
         "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "reversing": "speed",

@@ -10,14 +10,15 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.effects import Effect, beyond, curve_within, lagged, played, shifted, since_start, soft_clip
+from mkc_torch.effects import Effect, beyond, curve_within, lagged, played, shifted, since_start, soft_clip, travelled
+from mkc_torch.effects.kinds import absolute_zero
 from mkc_torch.effects.waveforms import outer_product
 from mkc_torch.simulation.dynamics.ports import memory_at
 from mkc_torch.simulation.ports import SignalSizes
 from tests.effects.contexts import contexts_of, kinds_of_shapes, size_of
 
-NONLINEAR = ("delay", "clock_drift", "sensor_clock_drift", "backlash")
-"""Effects on an output that are not linear in γ, a time or a gap."""
+NONLINEAR = ("delay", "clock_drift", "sensor_clock_drift", "backlash", "driver_parameter_arrhenius")
+"""Effects on an output or a parameter that are not linear in γ: a time, a gap, or an exponent."""
 
 
 def is_nonlinear(effect):
@@ -277,11 +278,12 @@ class OfEveryShape:
             means = context.driver_means or (0.0,)
             names |= {"recorded": "d", "driver": f"(d - {means[0]!r})"}
             names["zero_of_driver"] = "273.15" if context.units[0] == "°C" else "0.0"
+            names["mean"] = repr(means[0])
+            names["absolute_mean"] = repr(means[0] + absolute_zero(context.units[0], means[0]))
         known = {"x": x, "torch": torch, "time": context.time, "run": context.runs}
         known |= {"d": context.recorded} if context.units else {}
         known |= {"lagged": lagged, "shifted": shifted, "played": played, "soft_clip": soft_clip, "beyond": beyond}
-        known |= {"since_start": since_start}
-        known["curve_within"] = curve_within
+        known |= {"since_start": since_start, "curve_within": curve_within, "travelled": travelled}
         shape = {name: float(value) for name, value in shape.items()}
         lines = effect.code(gamma.tolist(), shape, names)
         written = torch.stack([eval(line, known) + torch.zeros_like(context.time) for line in lines], -1)

@@ -16,6 +16,8 @@ from mkc_torch.effects import (
     is_curve,
     words_of,
 )
+from mkc_torch.effects.dynamics.driver_output_quadratic import DriverOutputQuadratic
+from mkc_torch.effects.dynamics.driver_parameter_quadratic import DriverParameterQuadratic
 from mkc_torch.effects.sensor.field_gradient import FieldGradient
 from mkc_torch.effects.sensor.magnetic_pole import MagneticPole
 from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
@@ -107,6 +109,8 @@ def test_ids_are_unchanged():
         "thermal_loss", "input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlash", "bouc_wen_hysteresis",
         "added_mass", "magnus_lift", "buoyancy", "hidden_lag", "hidden_mode", "power_law", "input_lag", "input_square",
         "driver_force", "driver_exchange", "driver_rate_constant", "driver_input_gain",
+        "driver_parameter", "driver_parameter_quadratic", "driver_parameter_arrhenius",
+        "driver_output", "driver_output_quadratic", "driver_output_lagged",
     }  # fmt: skip
     assert (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED) == CATALOGUE
     several = (
@@ -120,11 +124,15 @@ def test_ids_are_unchanged():
 def test_optional_abilities_of_effects():
     assert {e.id for e in CATALOGUE if e.persistent_change} == {"hard_iron_step", "offset_drift", "gain_drift"}
     assert {e.id for e in CATALOGUE if type(e).bind is not Effect.bind} == {"unknown"}
-    assert {type(e) for e in CATALOGUE if e.has_basis} == {FieldGradient, MagneticPole}
+    assert {type(e) for e in CATALOGUE if e.has_basis} == {
+        FieldGradient, MagneticPole, DriverOutputQuadratic, DriverParameterQuadratic,
+    }  # fmt: skip
     assert {e.id for e in CATALOGUE if e.has_code} == {e.id for e in DYNAMICS} | {"output_saturation"}
     assert {e.id for e in CATALOGUE if e.simpler} == {"coupling", "sensor_lag", "delay"}
     coulomb = dict.fromkeys(("stribeck_friction", "load_dependent_friction"), "coulomb_friction")
-    assert {e.id: e.reduces_to.id for e in CATALOGUE if e.reduces_to} == coulomb
+    linear = dict.fromkeys(("driver_parameter_quadratic", "driver_parameter_arrhenius"), "driver_parameter")
+    linear |= {"driver_output_quadratic": "driver_output", "input_transport_delay": "input_delay"}
+    assert {e.id: e.reduces_to.id for e in CATALOGUE if e.reduces_to} == coulomb | linear
     assert {e.id for e in CATALOGUE if e.is_curve} == {"unknown"}
     assert {e.id for e in CATALOGUE if e.is_generalisation} == {
         "power_law", "hidden_lag", "hidden_mode", "gravity_sag", "driver_linear", "driver_quadratic",

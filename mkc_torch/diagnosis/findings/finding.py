@@ -175,11 +175,11 @@ def _references(term: Term) -> tuple[Reference, ...]:
 
 
 def places_of(term: Term, channels: Sequence[str]) -> tuple[str, ...]:
-    """Return the places on which a term acts: channels of a residual, or rates and inputs of a simulation."""
+    """Return the places on which a term acts: channels of a residual, or rates, inputs and parameters."""
     if "rate of " in term.at or term.at.startswith("exchange of "):
         return tuple(f"rate of {name}" for name in channels)
-    at_input = term.at.startswith(("input ", "entry of "))
-    return tuple(f"input {name}" for name in channels) if at_input else tuple(channels)
+    kind = "input" if term.at.startswith("entry of ") else term.at.partition(" ")[0]
+    return tuple(f"{kind} {name}" if kind in ("input", "parameter") else name for name in channels)
 
 
 def _own(final: FinalEstimate, number: int) -> tuple[Tensor, Tensor]:

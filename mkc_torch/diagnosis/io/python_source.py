@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkc_torch.diagnosis.model.joint import in_order_of_the_chain
-from mkc_torch.effects.kinds import zero_of
+from mkc_torch.effects.kinds import absolute_zero, zero_of
 from mkc_torch.recording.recording import DEFAULT_UNITS
 from mkc_torch.simulation.dynamics.definition import Dynamics
 from mkc_torch.simulation.dynamics.entries import entries
@@ -34,6 +34,7 @@ _FROM_HERE: Mapping[str, str] = {
     "since_start(": "from mkc_torch.effects import since_start",
     "soft_clip(": "from mkc_torch.effects import soft_clip",
     "curve_within(": "from mkc_torch.effects import curve_within",
+    "travelled(": "from mkc_torch.effects import travelled",
     "beyond(": "from mkc_torch.effects import beyond",
     "SimpleNamespace(": "from types import SimpleNamespace",
     "Parameter(": "from mkc_torch.simulation import Parameter",
@@ -72,11 +73,14 @@ def python_source(
     inputs: list[str] = []
     entering: list[str] = []
     outputs: list[str] = []
+    varied: list[str] = []
+    single: list[str] = []
     for number in in_order_of_the_chain(terms, range(len(terms))):
         term, gamma = terms[number], gammas[number]
         lines = _lines(term, [_rounded(float(value)) for value in gamma], system, measured)
-        kinds = {"output": outputs, "input": inputs, "entry": entering}
+        kinds = {"output": outputs, "input": inputs, "entry": entering, "parameter": varied}
         place = kinds.get(term.port.partition(" ")[0], rates)
+        place = single if term.port.startswith("output ") else place
         if place is outputs and outputs:
             place.append("y = dict(shown)")  # the next effect acts on these outputs
         place += [f"# {term.effect.id}: {term.effect.equation}", *lines]
@@ -92,9 +96,11 @@ def python_source(
         *_hold(system, holds),
         *_restarts(system),
         *_states(system, memories, theta),
-        *_actuator(inputs),
+        *_varied(varied),
+        *_output(single, varied),
+        *_actuator(inputs, varied, own=kind.actuator is not Dynamics.actuator, columns=bool(_inputs(system, terms))),
         *_entering(entering),
-        *_derivative(memories, rates, "self.entering(time, x, u, p)" if entering else "u"),
+        *_derivative(memories, rates, "self.entering(time, x, u, p)" if entering else "u", varied),
         *_sensor(outputs),
     ]
     text = "\n".join(body)
@@ -186,10 +192,38 @@ def _states(system: Dynamics, memories: Mapping[str, str], theta: Sequence[float
     return [*lines, f"    initial = {{**{base}.initial, {guessed}}}"] if guessed else lines
 
 
-def _actuator(inputs: list[str]) -> list[str]:
-    if not inputs:
+def _varied(varied: list[str]) -> list[str]:
+    """Return the method of the parameters that effects change."""
+    if not varied:
         return []
-    lines = ["acting = SimpleNamespace(**vars(u))", *inputs, "return super().actuator(time, acting, p, run)"]
+    lines = ["p = SimpleNamespace(**vars(p))", *varied, "return p"]
+    return ["", "    def varied(self, u, p):", *(f"        {line}" for line in lines)]
+
+
+def _output(single: list[str], varied: list[str]) -> list[str]:
+    """Return the method of the outputs, with effects on parameters and on single outputs."""
+    if not single and not varied:
+        return []
+    plain = f"super().output(time, x, u, {'self.varied(u, p)' if varied else 'p'})"
+    lines = [f"shown = dict({plain})", *single, "return shown"] if single else [f"return {plain}"]
+    return ["", "    def output(self, time, x, u, p):", *(f"        {line}" for line in lines)]
+
+
+def _actuator(inputs: list[str], varied: list[str], *, own: bool, columns: bool) -> list[str]:
+    """Return the method of the acting inputs.
+
+    Args:
+        inputs, varied: lines of the effects on inputs and on parameters.
+        own: whether the class has an actuator of its own, which may depend on parameters.
+        columns: whether there are new inputs, which it would not return.
+    """
+    if not inputs and not (own and (varied or columns)):
+        return []
+    p = "self.varied(u, p)" if varied else "p"
+    u = "acting" if inputs else "u"
+    acting = ["acting = SimpleNamespace(**vars(u))", *inputs] if inputs else []
+    found = f"super().actuator(time, {u}, {p}, run)"
+    lines = [*acting, f"return {{**vars({u}), **{found}}}" if own and columns else f"return {found}"]
     return ["", "    def actuator(self, time, u, p, run):", *(f"        {line}" for line in lines)]
 
 
@@ -200,8 +234,15 @@ def _entering(entering: list[str]) -> list[str]:
     return ["", "    def entering(self, time, x, u, p):", *(f"        {line}" for line in lines)]
 
 
-def _derivative(memories: Mapping[str, str], rates: list[str], acting: str) -> list[str]:
-    if not rates and acting == "u":
+def _derivative(memories: Mapping[str, str], rates: list[str], acting: str, varied: list[str]) -> list[str]:
+    p = "self.varied(u, p)" if varied else "p"
+    if not rates and (varied or acting != "u"):
+        return [
+            "",
+            "    def derivative(self, time, x, u, p):",
+            f"        return super().derivative(time, x, {acting}, {p})",
+        ]
+    if not rates:
         return []
     still = [f'rates["{name}"] = torch.zeros_like(x.{name})' for name in memories]
     return [
@@ -210,7 +251,7 @@ def _derivative(memories: Mapping[str, str], rates: list[str], acting: str) -> l
         *(f"        {line}" for line in ["rates = self.plain_rates(time, x, u, p)", *still, *rates, "return rates"]),
         "",
         "    def plain_rates(self, time, x, u, p):",
-        f"        rates = super().derivative(time, x, {acting}, p)",
+        f"        rates = super().derivative(time, x, {acting}, {p})",
         '        return dict(rates) if hasattr(rates, "keys") else dict(zip(self.states, rates))',
     ]
 
@@ -258,6 +299,12 @@ def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Seque
     elif term.port.startswith("input "):
         name = term.port.removeprefix("input ")
         targets, names = [f"acting.{name}"], {"own": f"acting.{name}"}
+    elif term.port.startswith("output "):
+        name = term.port.removeprefix("output ")
+        targets, names = [f'shown["{name}"]'], {"own": f'shown["{name}"]'}
+    elif term.port.startswith("parameter "):
+        name = term.port.removeprefix("parameter ")
+        targets, names = [f"p.{name}"], {"own": f"p.{name}"}
     else:
         targets, names = [f'shown["{name}"]' for name in measured], {name: f'y["{name}"]' for name in measured}
     added = term.effect.code(gamma, shape, {**names, **_driver_names(term, names)})
@@ -289,8 +336,11 @@ def _driver_names(term: Term, names: Mapping[str, str]) -> dict[str, str]:
     if term.driver is None:
         return {}
     recorded, mean = f"u.{term.driver.columns[0]}", _rounded(float(term.driver.reference[0]))
+    absolute = absolute_zero(term.driver.units[0], mean)
     return {
         "recorded": recorded,
+        "mean": repr(mean),
+        "absolute_mean": repr(_rounded(mean + absolute)),
         "driver": f"({recorded} - {mean!r})" if mean >= 0 else f"({recorded} + {-mean!r})",
         "zero_of_driver": repr(zero_of(term.driver.units[0])) if term.driver.units[0] else names.get("zero", "0.0"),
     }

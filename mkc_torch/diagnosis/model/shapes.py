@@ -12,10 +12,11 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.model.fit import FULL, Effort, FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.term import Driver, Drivers, Term, find_drivers, run_parallel
+from mkc_torch.diagnosis.model.term import Driver, Drivers, Term, find_drivers, input_drivers, run_parallel
 from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Shape
+from mkc_torch.effects.kinds import kind_of
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.ports import Change, Nearby, Port, SignalSizes
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
@@ -64,18 +65,22 @@ def candidate_terms(
 ) -> tuple[Term, ...]:
     """Return each effect that has a port in the simulation, with each of its drivers and each shape of its grid."""
     terms = []
+    inputs = input_drivers(prepared)
     own = {driver.columns for driver in drivers if not _repeats_an_input(driver, prepared)}
+    own |= {driver.columns for driver in inputs}
     for effect in effects:
         places = ports_of(effect, prepared.ports)
         # an effect without roles, or with an optional driver, is also tried without a driver
         alone = not effect.roles or effect.driver_optional
-        fitting = [*([None] if alone else []), *(d for d in drivers if _drives(d, effect))]
+        known = [*drivers, *(inputs if effect.driven_by_inputs else ())]
+        fitting = [*([None] if alone else []), *(d for d in known if _drives(d, effect))]
         shapes = effect.shapes(prepared.time)
         terms += [
             Term(effect, driver, shape, "" if at == effect.port else at)
             for at in places
             for driver in fitting
-            if driver is None or driver.columns in own or prepared.ports[at].clock is None
+            if driver is None or driver.columns in own or prepared.dynamics is None
+            if driver is None or at != f"input {driver.columns[0]}"
             for shape in (absolute(effect, shape, prepared.ports[at], driver) for shape in shapes)
         ]
     return tuple(term for term in terms if not within_a_sample(term, prepared))
@@ -156,7 +161,12 @@ def reach_of(term: Term, prepared: PreparedSimulation) -> dict[str, tuple[float,
 
 
 def _drives(driver: Driver, effect: Effect) -> bool:
-    """Whether a driver has one of an effect's roles; a curve without a name accepts any single column."""
+    """Whether a driver has one of an effect's roles and kinds; a curve without a name accepts any single column."""
+    kinds = effect.driver_kinds
+    if kinds and kind_of(driver.units[0], driver.columns[0]) not in kinds:
+        return False
+    if effect.positive_driver and not bool((driver.values + driver.reference >= 0.0).all()):
+        return False
     return driver.role in effect.roles or (bool(effect.roles) and effect.is_curve and len(driver.columns) == 1)
 
 

@@ -120,6 +120,17 @@ def _driver(
     return Driver(columns, role, values - reference, reference, units, copies)
 
 
+def input_drivers(prepared: PreparedSimulation) -> tuple[Driver, ...]:
+    """Return the inputs of a simulation that vary, as drivers of effects that inputs can drive."""
+    names = [name.removeprefix("input ") for name, port in prepared.ports.items() if port.kind == "input"]
+    known = prepared.recording
+    return tuple(
+        _driver((name,), role_of(name, known.units[name]), known[name].unsqueeze(-1), (known.units[name],))
+        for name in names
+        if name in known and float(known[name].amax()) > float(known[name].amin())
+    )
+
+
 def role_of(name: str, unit: str) -> str:
     """Return the role of a column by its name's first word, else by its unit.
 
@@ -290,6 +301,7 @@ def context_at(port: Port, time: Tensor, values: Tensor, driver: Driver | None, 
         port.part_units,
         port.run,
         () if driver is None else tuple(driver.reference.tolist()),
+        () if driver is None else driver.columns,
     )
 
 

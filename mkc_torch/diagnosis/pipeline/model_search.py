@@ -33,6 +33,7 @@ from mkc_torch.diagnosis.score import basis_of, score, separation
 from mkc_torch.diagnosis.search.beam import BeamSearch
 from mkc_torch.diagnosis.search.candidate import Candidate, in_order
 from mkc_torch.diagnosis.search.columns import best_change
+from mkc_torch.diagnosis.search.moves import comes_by_exchange
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.search.screening import screened
@@ -44,6 +45,9 @@ Keep = Callable[[StepwiseSearch], object]
 
 _NEXT = 3
 """Models that are asked in turn if held-out blocks refuse the only effect of the best."""
+
+_SAME_SCORE = 0.1
+"""Nats within which the scores of two fits of the same physics are equal."""
 
 _QUICK_MODELS = 8
 """Largest number of models in a quick look."""
@@ -143,7 +147,8 @@ def _beam(base: ProcessNoiseFit, first: SearchResult, terms: tuple[Term, ...], o
     """
     start = _start(base)
     basis = basis_of(base.fit, len({term.key for term in terms}), options.declared, options.settings)
-    leaders = [terms[rival.number] for rival in first.ranking[: options.settings.search.own_noise]]
+    ranked = [term for term in (terms[rival.number] for rival in first.ranking) if not comes_by_exchange(term)]
+    leaders = ranked[: options.settings.search.own_noise]
     beam = BeamSearch(terms, basis, options.settings, options.declared, fixed=options.fixed)
     beam.noisy = base.fit if has_process_noise(base.fit) and not options.quick else None
     significant = first.p_value <= options.level
@@ -204,11 +209,43 @@ def _in_turn(beam: BeamSearch) -> list[list[Candidate]]:
     good = [model for model in ranked if model.value > alone.value]
     behind = beam.settings.naming.separable * beam.basis.kappa
     alike = [model for model in good if model.value >= good[0].value - behind]
-    for model in [*sorted(alike, key=lambda model: model.price), *good[len(alike) :]]:
+    for model in [*_by_price(alike, beam.terms), *good[len(alike) :]]:
         chain = _chain(model, beam)
         if all(later.value > earlier.value for earlier, later in itertools.pairwise([alone, *chain])):
             return [chain, *[other for other in single if other[0].key != chain[0].key]][:_NEXT]
     return single[:_NEXT]
+
+
+def _by_price(models: Sequence[Candidate], terms: Sequence[Term]) -> list[Candidate]:
+    """Order models by price, at equal price first those to first order in their columns, then by score.
+
+    The same dependence on a column can have two names, as a loss and as the parameter of this loss. Of models of equal
+    price and score with the same columns, the name that is first in the catalogue comes first.
+    """
+
+    def price(model: Candidate) -> tuple[float, int]:
+        return round(model.price, 6), sum(comes_by_exchange(term) for term in model.fit.model.terms)
+
+    def columns(model: Candidate) -> list[tuple[str, ...]]:
+        return sorted(term.columns for term in model.fit.model.terms)
+
+    def place(model: Candidate) -> list[int]:
+        own = {term.key for term in model.fit.model.terms}
+        return sorted(number for number, term in enumerate(terms) if term.key in own)
+
+    ordered = sorted(models, key=price)
+    for number, model in enumerate(ordered):
+        same = [
+            other
+            for other in ordered[number:]
+            if price(other) == price(model) and columns(other) == columns(model) and any(columns(model))
+            if abs(other.value - model.value) < _SAME_SCORE
+        ]
+        if same:
+            first = min(same, key=place)
+            ordered.remove(first)
+            ordered.insert(number, first)
+    return ordered
 
 
 def _named(models: Sequence[Candidate], alone: Candidate) -> list[Candidate]:

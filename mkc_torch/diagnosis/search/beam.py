@@ -9,12 +9,7 @@ from functools import partial
 
 import torch
 
-from mkc_torch.diagnosis.model.fit import (
-    SEARCH,
-    FittedModel,
-    fitted,
-    fitted_with_effect,
-)
+from mkc_torch.diagnosis.model.fit import SEARCH, FittedModel, fitted, fitted_with_effect
 from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise, has_process_noise
 from mkc_torch.diagnosis.model.shapes import shape_fitted, with_profiled_shape
 from mkc_torch.diagnosis.model.suspect import suspect_id
@@ -38,6 +33,7 @@ from mkc_torch.diagnosis.search.moves import (
     additions,
     at_size_zero,
     in_other_orders,
+    one_form_each,
     special_cases,
     with_wide_grid,
 )
@@ -197,7 +193,7 @@ class BeamSearch:
                     continue
                 rest = [*fit.model.terms[:number], *fit.model.terms[number + 1 :], other]
                 move = f"exchange {self._id(term)} for {self._id(other)}"
-                works.append((model_key(rest), move, partial(fitted_exchanged, fit, number, self._all(other))))
+                works.append((model_key(rest), move, partial(fitted_exchanged, fit, number, self._all(other, term))))
         orders = in_other_orders(fit)
         works += [(model_key(o), "another order in series", partial(fitted_reordered, fit, o)) for o in orders]
         self._fit(works, fit, most)
@@ -227,7 +223,8 @@ class BeamSearch:
             if rest is None:
                 continue
             near = [other for other in terms if ports[other.port].channels == ports[term.port].channels]
-            found = sorted(additions(rest.fit, near, self.settings.noise), key=self._worth, reverse=True)
+            found = one_form_each(additions(rest.fit, near, self.settings.noise), self._worth)
+            found = sorted(found, key=self._worth, reverse=True)
             for addition in [other for other in found if other.key != term.key][:_EXCHANGES]:
                 other = addition.starts[0][0]
                 key = model_key([*rest.fit.model.terms, other])
@@ -278,6 +275,7 @@ class BeamSearch:
     ) -> list[Addition]:
         """Return the additions to fit: the largest linear gains, less the price of the effect's numbers."""
         most = _ADDITIONS[min(rank, len(_ADDITIONS) - 1)]
+        found = one_form_each(found, self._worth)
         ranked = sorted(found, key=self._worth, reverse=True)
         if model.fit.model.terms:
             own = {term.effect.id for term in model.fit.model.terms}
@@ -305,8 +303,11 @@ class BeamSearch:
     def _id(self, term: Term) -> str:
         return suspect_id(term, self.terms)
 
-    def _all(self, term: Term) -> tuple[Term, ...]:
-        return tuple(other for other in self.terms if other.key == term.key)
+    def _all(self, term: Term, near: Term) -> tuple[Term, ...]:
+        """Return an effect at all shapes of its grid, first at the shape of another where both have its numbers."""
+        known = {name: value for name, value in near.shape.items() if name in term.shape}
+        own = tuple(other for other in self.terms if other.key == term.key)
+        return (replace(term, shape={**term.shape, **known}), *own) if known else own
 
     def _fit(
         self, works: Sequence[tuple[ModelKey, str, Callable[[], FittedModel | None]]], near: FittedModel, most: int

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -34,6 +34,9 @@ _SHARES = (0.2, 0.4, 0.6, 0.8)
 
 _SPANNED = 1e-6
 """Share of a candidate's change that is not a change by parameters, below which it acts as they do."""
+
+_BETTER = 1e-6
+"""Nats by which a further form has to be worth more than the form to first order; forms of one tangent differ less."""
 
 STARTS = 3
 """Shapes from which an effect is fitted: the best local maxima of its linear gain."""
@@ -201,7 +204,10 @@ def _longest_run(prepared: PreparedSimulation) -> float:
 
 
 def special_cases(term: Term, terms: Sequence[Term], prepared: PreparedSimulation) -> list[Term]:
-    """Return the candidates that are a special case of an effect, or that it is one of, at the same channels."""
+    """Return the candidates that are a special case of an effect, or that it is one of, at the same channels.
+
+    Of a dependence on a column also its other forms, which have the same special case.
+    """
     channels = prepared.ports[term.port].channels
     found = []
     for other in terms:
@@ -209,9 +215,45 @@ def special_cases(term: Term, terms: Sequence[Term], prepared: PreparedSimulatio
         nested = any(
             general.reduces_to is not None and general.reduces_to.id == special.id for general, special in pair
         )
-        if nested and prepared.ports[other.port].channels == channels and other.columns == term.columns:
+        if comes_by_exchange(term) and comes_by_exchange(other) and other.effect.id != term.effect.id:
+            nested = nested or _special_id(other) == _special_id(term)
+        alike = other.columns == term.columns or not (other.columns and term.columns)
+        if nested and prepared.ports[other.port].channels == channels and alike:
             found.append(other)
     return found
+
+
+def _special_id(term: Term) -> str:
+    return term.effect.reduces_to.id if term.effect.reduces_to is not None else ""
+
+
+def comes_by_exchange(term: Term) -> bool:
+    """Whether an effect is a further form of a dependence on a column, tried in exchange for its special case."""
+    return term.driver is not None and term.effect.reduces_to is not None
+
+
+def one_form_each(found: Sequence[Addition], worth: Callable[[Addition], float]) -> list[Addition]:
+    """Return additions with one form of each dependence on a column: the first order, unless another is worth more.
+
+    Otherwise the forms of one dependence would take the places of other effects. A further form whose special case is
+    not among the additions comes only in exchange.
+
+    Args:
+        found: the additions.
+        worth: the linear gain of an addition, less the price of its numbers.
+    """
+    families: dict[Key, list[Addition]] = {}
+    for addition in found:
+        term = addition.starts[0][0]
+        special = term.effect.reduces_to if comes_by_exchange(term) else None
+        families.setdefault((special.id if special else term.effect.id, *term.key[1:]), []).append(addition)
+    chosen = []
+    for key, members in families.items():
+        first = [addition for addition in members if addition.key == key]
+        if first:
+            best = max(members, key=worth)
+            chosen.append(best if worth(best) > worth(first[0]) + _BETTER else first[0])
+    return chosen
 
 
 def in_other_orders(fit: FittedModel) -> list[tuple[Term, ...]]:

@@ -15,6 +15,12 @@ from mkc_torch.effects.dynamics.dead_zone import DeadZone
 from mkc_torch.effects.dynamics.driver_exchange import DriverExchange
 from mkc_torch.effects.dynamics.driver_force import DriverForce
 from mkc_torch.effects.dynamics.driver_input_gain import DriverInputGain
+from mkc_torch.effects.dynamics.driver_output import DriverOutput
+from mkc_torch.effects.dynamics.driver_output_lagged import DriverOutputLagged
+from mkc_torch.effects.dynamics.driver_output_quadratic import DriverOutputQuadratic
+from mkc_torch.effects.dynamics.driver_parameter import DriverParameter
+from mkc_torch.effects.dynamics.driver_parameter_arrhenius import DriverParameterArrhenius
+from mkc_torch.effects.dynamics.driver_parameter_quadratic import DriverParameterQuadratic
 from mkc_torch.effects.dynamics.driver_rate_constant import DriverRateConstant
 from mkc_torch.effects.dynamics.hard_stop import HardStop
 from mkc_torch.effects.dynamics.hidden_lag import HiddenLag
@@ -23,6 +29,7 @@ from mkc_torch.effects.dynamics.input_delay import InputDelay
 from mkc_torch.effects.dynamics.input_lag import InputLag
 from mkc_torch.effects.dynamics.input_saturation import InputSaturation
 from mkc_torch.effects.dynamics.input_square import InputSquare
+from mkc_torch.effects.dynamics.input_transport_delay import InputTransportDelay
 from mkc_torch.effects.dynamics.linear_drag import LinearDrag
 from mkc_torch.effects.dynamics.load_dependent_friction import LoadDependentFriction
 from mkc_torch.effects.dynamics.magnus_lift import MagnusLift
@@ -71,12 +78,19 @@ DYNAMICS: tuple[Effect, ...] = (
     ThermalLoss(to_surroundings=True),
     ThermalLoss(),
     InputDelay(),
+    InputTransportDelay(),
     InputLag(),
     InputSquare(),
     InputSaturation(),
     DeadZone(),
     DriverInputGain(),
+    DriverParameter(),
+    DriverParameterQuadratic(),
+    DriverParameterArrhenius(),
     Backlash(),
+    DriverOutput(),
+    DriverOutputQuadratic(),
+    DriverOutputLagged(),
     SensorLag(),
     SensorClockDrift(),
     UnknownRate("difference"),

@@ -184,7 +184,7 @@ def acts_on(finding: Finding) -> str:
     """
     if not finding.channels:
         return ""
-    channels = [f"the {name}" if name.startswith("rate of ") else name for name in finding.channels]
+    channels = [f"the {name}" if name.startswith(("rate of ", "parameter ")) else name for name in finding.channels]
     return _AXES.get(finding.channels, "acts on {channels}").format(channels=several(channels))
 
 

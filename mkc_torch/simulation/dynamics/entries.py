@@ -15,6 +15,7 @@ from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.surroundings import unit_of
 from mkc_torch.simulation.dynamics.trajectory import Grid
 from mkc_torch.simulation.dynamics.user_functions import namespace
+from mkc_torch.simulation.dynamics.varying import Acting
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.parameter import Parameter
 from mkc_torch.simulation.ports import Changes
@@ -48,17 +49,16 @@ class Enterable(Protocol):
         system: the equations.
         grid: the grid times.
         guess: (G, n), a first guess of the states.
-        inputs: (S, u), the inputs at the stations.
     """
 
     system: Equations
     grid: Grid
     guess: Float[Tensor, "G n"]
-    inputs: Float[Tensor, "S u"]
 
     @property
     def given(self) -> Float[Tensor, " p"]: ...
-    def rate(self, theta: Tensor, changes: Changes, inputs: Tensor | None = None) -> Callable[[Tensor], Tensor]: ...
+    def acting(self, theta: Tensor, changes: Changes) -> Acting: ...
+    def rate(self, theta: Tensor, changes: Changes, acting: Acting | None = None) -> Callable[[Tensor], Tensor]: ...
 
 
 def entries(system: Equations, known: Mapping[str, Parameter], kinematic: Mapping[str, str]) -> dict[str, str]:
@@ -108,8 +108,9 @@ def typical_gains(prepared: Enterable, name: str) -> dict[str, float]:
         name: of the input.
     """
     at, k = prepared.grid.spread(prepared.guess), prepared.system.inputs.index(name)
-    more = prepared.inputs + torch.eye(prepared.inputs.shape[1], dtype=at.dtype)[k]
-    once, other = (prepared.rate(prepared.given, {}, inputs)(at) for inputs in (prepared.inputs, more))
+    acting = prepared.acting(prepared.given, {})
+    more = acting._replace(inputs=acting.inputs + torch.eye(acting.inputs.shape[1], dtype=at.dtype)[k])
+    once, other = (prepared.rate(prepared.given, {}, now)(at) for now in (acting, more))
     return dict(zip(prepared.system.states, (other - once).abs().median(0).values.tolist(), strict=True))
 
 

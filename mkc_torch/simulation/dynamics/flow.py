@@ -87,7 +87,7 @@ def flow_along(
     G = step[:, None, None] * 0.5 * (unit + A @ unit)
     carry, noise_input = _between_samples(A, G, prepared.rows)
     at = states[prepared.rows]
-    predict = prepared.predicted(theta, prepared.acting_at_samples(theta, changes))
+    predict = prepared.predicted(prepared.acting_at_samples(theta, changes), changes)
     C = slopes(predict, at)[..., :n].detach()
     # what sensors and output effects add follows the trajectory, whose disturbances are estimated again
     new = prepared.measured - prepared.outputs_by_states(theta, changes, at) + prepared.output_disturbance(at)

@@ -13,7 +13,9 @@ from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.missing import MissingOutputs
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observer, ObserverJump
+from mkc_torch.simulation.dynamics.single_outputs import with_changes
 from mkc_torch.simulation.dynamics.user_functions import namespace
+from mkc_torch.simulation.dynamics.varying import Acting, varied
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.own_offsets import OwnOffset
 from mkc_torch.simulation.parameter import Parameter
@@ -72,6 +74,30 @@ class ObservedDynamics:
         """The parameters of the equations by name."""
         return Names(**dict(zip(self.known, theta[: len(self.known)].unbind(), strict=True)))
 
+    def acting(self, theta: Tensor, changes: Changes) -> Acting:
+        """The inputs and the parameters at the stations, with effects and the actuator."""
+        return Acting(self.acting_inputs(theta, changes), self.acting_parameters(theta, changes))
+
+    def acting_at_samples(self, theta: Tensor, changes: Changes) -> Acting:
+        """The inputs and the parameters at the samples, with effects and the actuator if an output depends on them."""
+        return Acting(self.inputs_at_samples(theta, changes), self.parameters_at_samples(theta, changes))
+
+    def acting_parameters(self, theta: Tensor, changes: Changes) -> Names:
+        """The parameters at the stations by name; a number where no effect changes it."""
+        p = self.parameters_of(theta)
+        return Names(**{**vars(p), **varied(p, changes, self.clock.time)})
+
+    def parameters_at_samples(self, theta: Tensor, changes: Changes) -> Names:
+        """The parameters at the samples by name; a number where no effect changes it."""
+        p = self.parameters_of(theta)
+        changed = varied(p, changes, self.clock.time)
+        return Names(**{**vars(p), **{name: values[self._stations_of_samples] for name, values in changed.items()}})
+
+    @property
+    def _stations_of_samples(self) -> Tensor:
+        """The station at each sample: the last one at the end, elsewhere the first of the interval that begins."""
+        return (3 * self.rows).clamp(max=len(self.clock.time) - 1)
+
     def acting_inputs(self, theta: Tensor, changes: Changes) -> Float[Tensor, "S u"]:
         """The inputs at the stations, with effects and the actuator."""
         if not self.system.inputs:
@@ -83,16 +109,15 @@ class ObservedDynamics:
             for k, name in enumerate(self.system.inputs)
         }
         run = self.run[self.clock.before]
-        acting = self.system.actuator(self.clock.time, Names(**columns), self.parameters_of(theta), run)
+        acting = self.system.actuator(self.clock.time, Names(**columns), self.acting_parameters(theta, changes), run)
         return torch.stack([acting[name] for name in self.system.inputs], -1)
 
-    def acting_at_samples(self, theta: Tensor, changes: Changes) -> Float[Tensor, "N u"]:
+    def inputs_at_samples(self, theta: Tensor, changes: Changes) -> Float[Tensor, "N u"]:
         """The inputs at the samples, with effects and the actuator if an output depends on them."""
         if not self.acts_on_outputs(changes):
             return self.inputs_at_rows
         added = self.acting_inputs(theta, changes) - self.inputs
-        last = len(added) - 1  # the station at the end; each other sample begins an interval of three stations
-        return self.inputs_at_rows + added[(3 * self.rows).clamp(max=last)]
+        return self.inputs_at_rows + added[self._stations_of_samples]
 
     def acts_on_outputs(self, changes: Changes) -> bool:
         """Whether an output depends on an input directly, and an effect or the actuator changes an input."""
@@ -169,17 +194,17 @@ class ObservedDynamics:
         """Lasting disturbances that the observer estimates in addition to the states."""
         return () if self.observer is None else self.observer.lasting
 
-    def jump(self, theta: Tensor, changes: Changes, inputs: Tensor | None = None) -> ObserverJump | None:
+    def jump(self, theta: Tensor, changes: Changes, acting: Acting | None = None) -> ObserverJump | None:
         """Correction of the states by the observer at the samples; None in open loop.
 
-        ``inputs`` are the acting inputs at the samples if they are known.
+        ``acting`` are the acting inputs and parameters at the samples if they are known.
         """
         if self.observer is None:
             return None
         n, extra = len(self.system.states), len(self.lasting)
         memories = sum(len(memory) for memory in self.remembering(changes).values())
         places = (*range(n), *range(n + memories, n + memories + extra))
-        by_states = self.predicted(theta, self.acting_at_samples(theta, changes) if inputs is None else inputs)
+        by_states = self.predicted(self.acting_at_samples(theta, changes) if acting is None else acting, changes)
 
         def predict(states: Tensor) -> Tensor:
             return by_states(states) + self.output_disturbance(states)
@@ -195,13 +220,14 @@ class ObservedDynamics:
             made = made + changes["output"](self.clean + made)
         return self.measured - made
 
-    def predicted(self, theta: Tensor, inputs: Tensor) -> Callable[[Tensor], Tensor]:
-        """The function from the states at the samples to the outputs there, before the sensors, with these inputs."""
-        n, p = len(self.system.states), self.parameters_of(theta)
-        u = namespace(self.system.inputs, inputs)
+    def predicted(self, acting: Acting, changes: Changes) -> Callable[[Tensor], Tensor]:
+        """The function from the states at the samples to the outputs there, with effects, before the sensors."""
+        n, p = len(self.system.states), acting.parameters
+        u = namespace(self.system.inputs, acting.inputs)
 
         def outputs(states: Tensor) -> Tensor:
-            values = self.system.output(self.time, namespace(self.system.states, states[:, :n]), u, p)
+            plain = self.system.output(self.time, namespace(self.system.states, states[:, :n]), u, p)
+            values = with_changes(plain, changes, states[:, 0])
             return torch.stack([values[name] + torch.zeros_like(states[:, 0]) for name in self.channels], -1)
 
         return outputs

@@ -1,4 +1,4 @@
-"""Ports of a system of differential equations, where effects act: rates, exchanges, inputs, their entries, outputs."""
+"""Ports of differential equations, where effects act: rates, exchanges, inputs, their entries, parameters, outputs."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.entries import entries
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.surroundings import surroundings
+from mkc_torch.simulation.dynamics.varying import varying_parameters
 from mkc_torch.simulation.parameter import Parameter
 from mkc_torch.simulation.ports import Port, SignalSizes, SignalTimes
 
@@ -66,7 +67,7 @@ class PortContext:
     run: Int[Tensor, " N"]
 
     def ports(self) -> dict[str, Port]:
-        """The ports: rates of states, exchanges between states of the same unit, inputs, their entries, and outputs.
+        """The ports: rates, exchanges between states of the same unit, inputs, their entries, parameters, and outputs.
 
         Where an input moves one rate only, an effect at its entry would be the same as at the rate, and has no port.
         """
@@ -108,6 +109,30 @@ class PortContext:
                 run=self.run[self.clock.before],
             )
         places |= {f"entry of {name}": self._entry_port(name, speed) for name, speed in self._entries().items()}
+        for name in varying_parameters(system):
+            known = self.known[name]
+            places[f"parameter {name}"] = Port(
+                (name,),
+                known.unit,
+                pointwise=False,
+                kind="parameter",
+                parts={"own": name},
+                part_units={"own": known.unit},
+                sizes={"own": SignalSizes(*(abs(known.value),) * 2, known.value, known.value)},
+                clock=self.clock,
+                run=self.run[self.clock.before],
+            )
+        for name in self.channels:
+            unit = self._unit_of(name)
+            places[f"output {name}"] = Port(
+                (name,),
+                unit,
+                pointwise=False,
+                kind="single output",
+                parts={"own": name},
+                part_units={"own": unit},
+                run=self.run,
+            )
         parts = {"own": self.channels[0], **{f"output {name}": name for name in self.channels[1:]}}
         if self.system.inputs:
             parts["driven"] = self.channels[0]

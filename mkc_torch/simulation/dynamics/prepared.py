@@ -32,8 +32,10 @@ from mkc_torch.simulation.dynamics.ports import ENTRY, RATES, PortContext, commo
 from mkc_torch.simulation.dynamics.refinement import FINEST, enough_parts
 from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
 from mkc_torch.simulation.dynamics.settings import HORIZON
+from mkc_torch.simulation.dynamics.single_outputs import with_changes
 from mkc_torch.simulation.dynamics.trajectory import Trajectory, marched, solve, stations
 from mkc_torch.simulation.dynamics.user_functions import kinematic, namespace
+from mkc_torch.simulation.dynamics.varying import Acting
 from mkc_torch.simulation.parameter import known_parameters
 from mkc_torch.simulation.ports import Answer, Changes, Nearby, Port
 from mkc_torch.simulation.runs import experiment_runs
@@ -172,7 +174,7 @@ class PreparedDynamics(CheckedDynamics):
 
     @cached_property
     def ports(self) -> dict[str, Port]:
-        """The ports: rates of states, exchanges between states of the same unit, inputs, their entries, and outputs."""
+        """The ports: rates, exchanges, inputs, their entries, parameters, and the outputs."""
         places = PortContext(
             self.system,
             self.recording,
@@ -243,31 +245,37 @@ class PreparedDynamics(CheckedDynamics):
         theta: Float[Tensor, " p"],
         changes: Changes,
         states: Float[Tensor, "N w"],
-        inputs: Float[Tensor, "N u"] | None = None,
+        acting: Acting | None = None,
     ) -> Float[Tensor, "N m"]:
         """The outputs at the samples from the states there, including internal states of effects and disturbances.
 
-        ``inputs`` are the acting inputs at the samples if they are known.
+        ``acting`` are the acting inputs and parameters at the samples if they are known.
         """
-        outputs = self._outputs(theta, self.acting_at_samples(theta, changes) if inputs is None else inputs, states)
+        outputs = self._outputs(self.acting_at_samples(theta, changes) if acting is None else acting, changes, states)
         if "output" in changes:
             outputs = outputs + changes["output"](outputs)
         return outputs + self.output_disturbance(states)
 
     def signals(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Mapping[str, Tensor]:
         found = self.trajectory(theta, changes, near)
-        inputs = self.acting_inputs(theta, changes)
+        acting = self.acting(theta, changes)
         jump = self.jump(theta, changes)
-        at_stations = stations(self.rate(theta, changes), found.states, self.grid.step.unsqueeze(-1), jump)
+        at_stations = stations(self.rate(theta, changes, acting), found.states, self.grid.step.unsqueeze(-1), jump)
         at_stations = at_stations[:, : len(self.system.states)]
-        outputs = self._outputs(theta, self.acting_at_samples(theta, changes), found.states[self.rows])
-        rates = self._rates(theta, at_stations, self._entered(at_stations, inputs, changes))
+        here, at_samples = self.acting_at_samples(theta, changes), found.states[self.rows]
+        outputs, plain = self._outputs(here, changes, at_samples), self.predicted(here, {})(at_samples)
+        rates = self._rates(self._entered(at_stations, acting, changes), at_stations)
         at = {
-            name: self._signal(port, theta, at_stations, inputs, rates)
+            name: self._signal(port, acting, at_stations, rates)
             for name, port in self.ports.items()
             if port.kind in (*RATES, ENTRY)
         }
         at |= {f"input {name}": self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
+        still = torch.zeros_like(self.clock.time).unsqueeze(-1)
+        p = self.parameters_of(theta)
+        varying = [port.channels[0] for port in self.ports.values() if port.kind == "parameter"]
+        at |= {f"parameter {name}": getattr(p, name) + still for name in varying}
+        at |= {f"output {name}": plain[:, [k]] for k, name in enumerate(self.channels)}
         return at | {"output": outputs}
 
     def trajectory(
@@ -315,16 +323,16 @@ class PreparedDynamics(CheckedDynamics):
         begin = theta[len(self.known) :].unflatten(0, (-1, len(self.system.states)))
         return self.with_memories(begin, memories), memories
 
-    def rate(self, theta: Tensor, changes: Changes, inputs: Tensor | None = None) -> Callable[[Tensor], Tensor]:
+    def rate(self, theta: Tensor, changes: Changes, acting: Acting | None = None) -> Callable[[Tensor], Tensor]:
         """The function for the rates of the states, the effects' internal states and the lasting disturbances.
 
-        ``inputs`` are the acting inputs at the stations if they are known.
+        ``acting`` are the acting inputs and parameters at the stations if they are known.
         """
-        inputs = self.acting_inputs(theta, changes) if inputs is None else inputs
+        now = self.acting(theta, changes) if acting is None else acting
         remembering = self.remembering(changes)
         rows = [*self.system.states, *(name for memory in remembering.values() for name in memory)]
         lasting, n = self.lasting, len(self.system.states)
-        acting = [
+        added_at = [
             (port, [rows.index(row) for row in (*port.channels, *remembering.get(name, ()))], name)
             for name, port in self.ports.items()
             if port.kind in RATES and name in changes
@@ -332,10 +340,10 @@ class PreparedDynamics(CheckedDynamics):
 
         def rate(states: Tensor) -> Tensor:
             own, memories, disturbances = states.split([n, len(rows) - n, len(lasting)], -1)
-            plain = self._rates(theta, own, self._entered(own, inputs, changes))
+            plain = self._rates(self._entered(own, now, changes), own)
             rates = [*plain, *(torch.zeros_like(memory) for memory in memories.unbind(-1))]
-            for port, places, name in acting:
-                signal = self._signal(port, theta, own, inputs, plain)
+            for port, places, name in added_at:
+                signal = self._signal(port, now, own, plain)
                 if name in remembering:
                     signal = torch.cat([signal, states[:, places[len(port.channels) :]]], -1)
                 for k, added in zip(places, changes[name](signal).unbind(-1), strict=True):
@@ -348,30 +356,29 @@ class PreparedDynamics(CheckedDynamics):
 
         return rate
 
-    def _entered(self, states: Tensor, inputs: Tensor, changes: Changes) -> Float[Tensor, "S u"]:
+    def _entered(self, states: Tensor, acting: Acting, changes: Changes) -> Acting:
         """The acting inputs with the effects at their entries, which depend on the states."""
         added = {name: changes[f"entry of {name}"] for name in self.system.inputs if f"entry of {name}" in changes}
         if not added:
-            return inputs
-        signal = torch.cat([states, inputs], -1)
-        columns = zip(self.system.inputs, inputs.unbind(-1), strict=True)
-        return torch.stack([own + added[name](signal)[:, 0] if name in added else own for name, own in columns], -1)
+            return acting
+        signal = torch.cat([states, acting.inputs], -1)
+        columns = zip(self.system.inputs, acting.inputs.unbind(-1), strict=True)
+        inputs = [own + added[name](signal)[:, 0] if name in added else own for name, own in columns]
+        return acting._replace(inputs=torch.stack(inputs, -1))
 
-    def _rates(self, theta: Tensor, states: Tensor, inputs: Tensor) -> list[Tensor]:
+    def _rates(self, acting: Acting, states: Tensor) -> list[Tensor]:
         """Rates of the states by the simulation's own equations."""
-        u = namespace(self.system.inputs, inputs)
-        return self._derivative(self.clock.time, states, u, self.parameters_of(theta))
+        u = namespace(self.system.inputs, acting.inputs)
+        return self._derivative(self.clock.time, states, u, acting.parameters)
 
-    def _signal(
-        self, port: Port, theta: Tensor, states: Tensor, inputs: Tensor, rates: Sequence[Tensor]
-    ) -> Float[Tensor, "S k"]:
+    def _signal(self, port: Port, acting: Acting, states: Tensor, rates: Sequence[Tensor]) -> Float[Tensor, "S k"]:
         """Signal at a rate port: the states and inputs, then the rate or the load where the port has it."""
-        own = self.system.states.index(port.parts["own"])
+        own, inputs, p = self.system.states.index(port.parts["own"]), *acting
         if "rate" in port.parts:
             return torch.cat([states, inputs, rates[own].unsqueeze(-1)], -1)
         if "load" not in port.parts:
             return torch.cat([states, inputs], -1)
-        p, idle = self.parameters_of(theta), namespace(self.system.inputs, torch.zeros_like(inputs))
+        idle = namespace(self.system.inputs, torch.zeros_like(inputs))
         at_rest = torch.cat([states[:, :own], torch.zeros_like(states[:, [own]]), states[:, own + 1 :]], -1)
         coasting, held = (self._derivative(self.clock.time, x, idle, p)[own] for x in (states, at_rest))
         load = (rates[own] - coasting - held).abs().unsqueeze(-1)  # of the drive against the holding forces
@@ -382,11 +389,12 @@ class PreparedDynamics(CheckedDynamics):
         values = [found[s] for s in self.system.states] if isinstance(found, Mapping) else list(found)
         return [v + torch.zeros_like(states[:, 0]) for v in values]
 
-    def _outputs(self, theta: Tensor, inputs: Tensor, states: Float[Tensor, "N w"]) -> Float[Tensor, "N m"]:
-        p = self.parameters_of(theta)
+    def _outputs(self, acting: Acting, changes: Changes, states: Float[Tensor, "N w"]) -> Float[Tensor, "N m"]:
+        inputs, p = acting
         x = namespace(self.system.states, states[:, : len(self.system.states)])
         u = namespace(self.system.inputs, inputs)
-        values = self.system.sensor(self.time, self.system.output(self.time, x, u, p), p, self.run)
+        y = with_changes(self.system.output(self.time, x, u, p), changes, states[:, 0])
+        values = self.system.sensor(self.time, y, p, self.run)
         return torch.stack([values[name] for name in self.channels], -1)
 
     def _check_functions(self) -> None:

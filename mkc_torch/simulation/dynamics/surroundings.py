@@ -12,9 +12,13 @@ from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.user_functions import namespace
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.parameter import Parameter, known_parameters
+from mkc_torch.simulation.scattered import scattered
 
 _SHIFT = 0.7
 """Common shift of state and input in the test."""
+
+_ROWS = 20
+"""Number of moments at which rates are compared."""
 
 
 def surroundings(system: Equations) -> dict[str, str]:
@@ -56,7 +60,11 @@ def unit_of(system: Equations, name: str) -> str:
 
 def _shifts(system: Equations, known: dict[str, Parameter], state: str, alike: list[str], name: str) -> bool:
     """Whether the rate of a state depends on the states of its unit only by their difference to an input."""
-    time, states, inputs = _scattered(1), _scattered(len(system.states)), _scattered(len(system.inputs))
+    time, states, inputs = (
+        scattered(_ROWS, 1),
+        scattered(_ROWS, len(system.states)),
+        scattered(_ROWS, len(system.inputs)),
+    )
     # a parameter of 0 would hide what it multiplies; with a coefficient of 1 any input may look like the surroundings
     values = {
         parameter: (known[parameter].value or 1.0) * (1.0 + 0.01 * math.sqrt(number + 2.0))
@@ -76,11 +84,3 @@ def _shifts(system: Equations, known: dict[str, Parameter], state: str, alike: l
     if torch.allclose(rate(_SHIFT, 0.0), plain, rtol=1e-6, equal_nan=False):
         return False
     return torch.allclose(rate(_SHIFT, _SHIFT), plain, rtol=1e-9)
-
-
-def _scattered(count: int) -> torch.Tensor:
-    """Fixed scattered values from 0.1 to 1.1, (20, count), without the random number generator."""
-    turns = (
-        torch.arange(1, 21, dtype=torch.float64).unsqueeze(-1) * (torch.arange(count, dtype=torch.float64) + 2.7).sqrt()
-    )
-    return turns.remainder(1.0) + 0.1

@@ -13,11 +13,13 @@ from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import candidates_of
 from mkc_torch.diagnosis.search.moves import (
     STARTS,
+    Addition,
     additions,
     at_size_zero,
     in_other_orders,
     linear_gains,
     local_maxima,
+    one_form_each,
     special_cases,
     with_wide_grid,
 )
@@ -191,6 +193,56 @@ def test_special_cases_are_found_in_both_directions_at_the_same_channels():
     assert {term.effect.id for term in special_cases(stribeck, terms, prepared)} == {"coulomb_friction"}
     assert {term.effect.id for term in special_cases(dry, terms, prepared)} == {"stribeck_friction"}
     assert special_cases(first_term(fit, "quadratic_drag"), terms, prepared) == []
+
+
+class Strip(Dynamics):
+    """A body whose drag may depend on a recorded temperature, and whose input may be late by a flow."""
+
+    states, inputs, parameters = ("speed",), ("force",), {"drag": Parameter(0.4, unit="1/s")}
+
+    def derivative(self, time, x, u, p):
+        return {"speed": u.force - p.drag * x.speed}
+
+
+def strip_terms():
+    time = torch.arange(60, dtype=torch.float64) * 0.1
+    columns = {"time": time, "force": time.sin(), "speed": time.cos(), "temperature": 20.0 + 3.0 * (0.7 * time).sin()}
+    recording = Recording({**columns, "flow": 2.0 + (0.4 * time).cos()})
+    prepared = Strip().prepare(recording)
+    return prepared, candidates_of(Strip(), prepared, CATALOGUE, Settings().drivers)[1]
+
+
+def test_forms_of_a_dependence_on_a_column_are_exchanged_for_one_another():
+    prepared, terms = strip_terms()
+
+    def exchanged(name):
+        (term, *_) = [t for t in terms if t.effect.id == name and t.columns != ("flow",)]
+        return {(other.effect.id, *other.columns) for other in special_cases(term, terms, prepared)}
+
+    forms = {f"driver_parameter{form}" for form in ("", "_quadratic", "_arrhenius")}
+    for form in forms:
+        assert exchanged(form) == {(other, "temperature") for other in forms - {form}}
+    assert exchanged("input_delay") == {("input_transport_delay", "flow")}
+
+
+@pytest.mark.parametrize(
+    ("gains", "chosen"),
+    [
+        ((10.0, 10.0, 10.0), {"driver_parameter"}),
+        ((10.0, 30.0, 10.0), {"driver_parameter_quadratic"}),
+        ((None, 30.0, 10.0), set()),
+    ],
+)
+def test_one_form_of_a_dependence_is_added(gains, chosen):
+    _, terms = strip_terms()
+    names = ("driver_parameter", "driver_parameter_quadratic", "driver_parameter_arrhenius")
+    worth = {name: gain for name, gain in zip(names, gains, strict=True) if gain is not None}
+    worth["input_transport_delay"] = 99.0  # without its special case among the additions
+    columns = {name: ("flow",) if name == "input_transport_delay" else ("temperature",) for name in worth}
+    first = {name: next(t for t in terms if (t.effect.id, t.columns) == (name, columns[name])) for name in worth}
+    found = [Addition(((first[name], torch.zeros(1)),), gain) for name, gain in worth.items()]
+    kept = one_form_each(found, lambda addition: addition.gain)
+    assert {addition.starts[0][0].effect.id for addition in kept} == chosen
 
 
 def test_an_effect_in_series_with_a_lag_has_another_order():

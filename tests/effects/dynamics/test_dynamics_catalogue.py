@@ -52,7 +52,9 @@ def test_losses_dissipate_energy(name):
 
 def test_signs_of_amplitudes():
     assert {e.id for e in DYNAMICS if e.lower == -math.inf} >= set(EITHER_SIGN)
-    assert {e.id: e.upper for e in DYNAMICS if 1.0 < e.upper < math.inf} == {"hidden_lag": 100.0, "hidden_mode": 10.0}
+    assert {e.id: e.upper for e in DYNAMICS if 1.0 < e.upper < math.inf} == {
+        "hidden_lag": 100.0, "hidden_mode": 10.0, "driver_parameter_arrhenius": 2.0,
+    }  # fmt: skip
     assert {e.id for e in DYNAMICS if (e.lower, e.upper) == (0.0, 1.0)} >= set(SHARES)
     for effect in DYNAMICS:
         assert effect.one_sided or effect.id in EITHER_SIGN or effect.id not in IDS
@@ -60,9 +62,13 @@ def test_signs_of_amplitudes():
 
 def test_effects_on_equations_depend_on_states_inputs_or_columns():
     driven = {effect.id for effect in DYNAMICS if effect.roles and not effect.driver_optional}
-    assert driven == {"driver_force", "driver_exchange", "driver_rate_constant", "driver_input_gain"}
+    assert driven == {
+        "driver_force", "driver_exchange", "driver_rate_constant", "driver_input_gain",
+        "driver_parameter", "driver_parameter_quadratic", "driver_parameter_arrhenius",
+        "driver_output", "driver_output_quadratic", "driver_output_lagged", "input_transport_delay",
+    }  # fmt: skip
     for effect in DYNAMICS:
-        assert effect.follows_signal
+        assert effect.follows_signal != effect.id.startswith("driver_output")
         assert all(low > 0.0 for low, _ in effect.fitted_shape.values())
         assert effect.plot_axis in ("", *dynamic_context(effect).parts)
         assert effect.equation.startswith("δ")
@@ -431,7 +437,12 @@ class TestNeeds:
         class Pieces(Pendulum):
             restart_after = 2.0
 
-        assert set(prepared(Pieces, angle=torch.cos(3.0 * TIME)).ports) == {"rate of speed", "output"}
+        assert set(prepared(Pieces, angle=torch.cos(3.0 * TIME)).ports) == {
+            "rate of speed",
+            "parameter stiffness",
+            "output angle",
+            "output",
+        }
 
     def test_effects_tried_on_two_bodies_are_thermal(self):
         decay = torch.exp(-0.1 * TIME)

@@ -366,7 +366,8 @@ class TestPorts:
         ports = self.pendulum()
         # the rate of the angle is the speed by definition and has no port
         kinds = ("rate", "hysteretic rate", "lagged rate", "resonant rate")
-        assert list(ports) == [*(f"{kind} of speed" for kind in kinds), "output"]
+        own = ("parameter stiffness", "parameter damping", "output angle")
+        assert list(ports) == [*(f"{kind} of speed" for kind in kinds), *own, "output"]
         port = ports["rate of speed"]
         assert (port.kind, port.channels, port.unit, port.pointwise) == ("rate", ("speed",), "rad/s/s", False)
         assert port.carries == ("angle", "speed", "rate of speed")
@@ -396,7 +397,8 @@ class TestPorts:
         rates = [
             f"{kind} of {state}" for state in ("upper", "lower") for kind in ("rate", "lagged rate", "resonant rate")
         ]
-        names = [*rates, "exchange of upper and lower", "input pump", "output"]
+        own = ("parameter inflow", "parameter drain", "output upper", "output lower")
+        names = [*rates, "exchange of upper and lower", "input pump", *own, "output"]
         assert list(ports) == names
         both = ports["exchange of upper and lower"]
         assert (both.channels, both.kind, dict(both.parts)) == (

@@ -182,7 +182,7 @@ class TestObserverInterface:
 
         prepared, theta = forced_oscillator(sensor=sensor)
         at = prepared.trajectory(theta, {}).states[prepared.rows]
-        torch.testing.assert_close(prepared.predicted(theta, prepared.inputs_at_rows)(at), at[:, :1])
+        torch.testing.assert_close(prepared.predicted(prepared.acting_at_samples(theta, {}), {})(at), at[:, :1])
         clean = prepared.clean
         made = 0.2 * prepared.time[:, None] + 0.1 * clean**2
         torch.testing.assert_close(prepared.seen(theta, {}), prepared.measured - made)

@@ -26,6 +26,8 @@ from mkc_torch.simulation.dynamics.compiled.symbol import (
 from mkc_torch.simulation.dynamics.missing import MissingOutputs
 from mkc_torch.simulation.dynamics.observer import Observer, ObserverJump
 from mkc_torch.simulation.dynamics.trajectory import Grid
+from mkc_torch.simulation.dynamics.varying import Acting
+from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.ports import Changes
 
 if TYPE_CHECKING:
@@ -61,12 +63,15 @@ class Traceable(Protocol):
     def first_states(self, theta: Tensor, changes: Changes) -> tuple[Tensor, list[str]]: ...
     def with_memories(self, states: Tensor, memories: Sequence[str]) -> Tensor: ...
     def acting_inputs(self, theta: Tensor, changes: Changes) -> Tensor: ...
-    def rate(self, theta: Tensor, changes: Changes, inputs: Tensor | None = None) -> Callable[[Tensor], Tensor]: ...
+    def acting_parameters(self, theta: Tensor, changes: Changes) -> Names: ...
     def acts_on_outputs(self, changes: Changes) -> bool: ...
-    def acting_at_samples(self, theta: Tensor, changes: Changes) -> Tensor: ...
-    def jump(self, theta: Tensor, changes: Changes, inputs: Tensor | None = None) -> ObserverJump | None: ...
+    def inputs_at_samples(self, theta: Tensor, changes: Changes) -> Tensor: ...
+    def parameters_at_samples(self, theta: Tensor, changes: Changes) -> Names: ...
+    def parameters_of(self, theta: Tensor) -> Names: ...
+    def rate(self, theta: Tensor, changes: Changes, acting: Acting | None = None) -> Callable[[Tensor], Tensor]: ...
+    def jump(self, theta: Tensor, changes: Changes, acting: Acting | None = None) -> ObserverJump | None: ...
     def outputs_by_states(
-        self, theta: Tensor, changes: Changes, states: Tensor, inputs: Tensor | None = None
+        self, theta: Tensor, changes: Changes, states: Tensor, acting: Acting | None = None
     ) -> Tensor: ...
 
 
@@ -133,8 +138,8 @@ def _traced(system: Traceable, meaning: Meaning, size: int, stations: int, sampl
     def at_samples() -> Symbol:
         return state_symbol(trace, samples, width)
 
-    rates = system.rate(theta, changes, _inputs(system, meaning, parameters))(state_symbol(trace, stations, width))
-    acting = _inputs_at_samples(system, meaning, parameters)
+    rates = system.rate(theta, changes, _at_stations(system, meaning, parameters))(state_symbol(trace, stations, width))
+    acting = _at_samples(system, meaning, parameters)
     jump = system.jump(theta, changes, acting)
     new = None if jump is None else block(jump.measured - jump.predict(at_samples()), samples, _as_is)
     try:
@@ -152,6 +157,41 @@ def _traced(system: Traceable, meaning: Meaning, size: int, stations: int, sampl
     )
 
 
+def _at_stations(system: Traceable, meaning: Meaning, parameters: Symbol) -> Acting:
+    """The inputs and the parameters at the stations."""
+    inputs = _inputs(system, meaning, parameters)
+    try:
+        return Acting(inputs, system.acting_parameters(*meaning(parameters)))
+    except Exception:  # a function may raise anything on a symbol; torch computes it instead, or raises again
+        return Acting(
+            inputs, _courses(system, meaning, parameters, system.acting_parameters, len(system.grid.stations))
+        )
+
+
+def _at_samples(system: Traceable, meaning: Meaning, parameters: Symbol) -> Acting:
+    """The inputs and the parameters at the samples; those that change are picked from the stations by torch."""
+    length, inputs = len(system.measured), _inputs_at_samples(system, meaning, parameters)
+    return Acting(inputs, _courses(system, meaning, parameters, system.parameters_at_samples, length))
+
+
+def _courses(
+    system: Traceable, meaning: Meaning, parameters: Symbol, of: Callable[[Tensor, Changes], Names], length: int
+) -> Names:
+    """The parameters, those that an effect changes as columns computed by torch."""
+    theta, changes = meaning(parameters)
+    known = vars(system.parameters_of(theta))
+    names = [name for name in known if f"parameter {name}" in changes]
+    if not names:
+        return Names(**known)
+
+    def columns(values: Tensor) -> Tensor:
+        found = of(*meaning(values))
+        return torch.stack([getattr(found, name) for name in names], -1)
+
+    symbol = course_symbol(columns, parameters, length, len(names))
+    return Names(**{**known, **dict(zip(names, symbol.unbind(-1), strict=True))})
+
+
 def _inputs(system: Traceable, meaning: Meaning, parameters: Symbol) -> Tensor:
     """The acting inputs at the stations; computed by torch where they cannot be traced, as behind a delay."""
     try:
@@ -165,9 +205,9 @@ def _inputs_at_samples(system: Traceable, meaning: Meaning, parameters: Symbol) 
     """The inputs that the outputs depend on; computed by torch where they are picked from the stations."""
     theta, changes = meaning(parameters)
     if not system.acts_on_outputs(changes):
-        return system.acting_at_samples(theta, changes)
+        return system.inputs_at_samples(theta, changes)
     samples, width = len(system.measured), system.inputs.shape[1]
-    return course_symbol(lambda values: system.acting_at_samples(*meaning(values)), parameters, samples, width)
+    return course_symbol(lambda values: system.inputs_at_samples(*meaning(values)), parameters, samples, width)
 
 
 def _as_is(column: Array) -> Array:

@@ -211,7 +211,9 @@ def candidates(prepared):
         for name, port in prepared.ports.items():
             if (port.kind or name) != effect.port or not set(effect.needs) <= set(port.parts):
                 continue
-            driver = Driver(("column",), "any", column.unsqueeze(-1), column[:1], ("A",)) if effect.roles else None
+            driver = (
+                Driver(("column",), "any", column.unsqueeze(-1), column[:1] + 2.0, ("A",)) if effect.roles else None
+            )
             yield Term(effect, driver, sized(effect, port, effect.shapes(prepared.time)[0]), name)
 
 
