@@ -1,6 +1,8 @@
 """A simulation whose free run leaves the recording is fitted in segments, if it follows them by its physics."""
 
 import json
+import math
+from time import monotonic
 
 import numpy as np
 import pytest
@@ -8,9 +10,22 @@ import torch
 
 from mkc_torch import diagnose
 from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
-from mkc_torch.diagnosis.pipeline.restarts import _best_length, segment_lengths, segment_polynomials
+from mkc_torch.diagnosis.pipeline.prepare import SearchOptions, prepare
+from mkc_torch.diagnosis.pipeline.restarts import (
+    restarted_problem,
+    segment_lengths,
+    segment_polynomials,
+    with_restarts_stated,
+)
+from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import CATALOGUE
 from tests.diagnosis.duffing import Duffing, PullingBack, duffing_recording
+
+
+def restarted(simulation, recording, effects=()):
+    """Return the problem of a diagnosis with restarts; None if the simulation does not follow in segments."""
+    problem = prepare(simulation, recording, effects, SearchOptions(0.05, 19, 3, 0, Settings()), None, lambda _: None)
+    return restarted_problem(problem, recording, math.inf, monotonic())
 
 
 def test_segments_are_halves_of_the_longest_run_down_to_few_samples():
@@ -37,8 +52,7 @@ def test_polynomials_are_those_of_numpy_in_each_segment():
 @pytest.mark.e2e
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_chaotic_simulation_follows_in_segments(seed):
-    prepared = Duffing().prepare(duffing_recording(seed, 400))
-    assert _best_length(Duffing(), prepared) is not None
+    assert restarted(Duffing(), duffing_recording(seed, 400)) is not None
 
 
 @pytest.mark.e2e
@@ -47,17 +61,26 @@ def test_a_chaotic_simulation_follows_in_segments(seed):
 )
 def test_a_wrong_simulation_does_not_follow_in_segments(simulation, unrelated):
     recording = duffing_recording(0, 400, unrelated=unrelated)
-    assert _best_length(simulation(), simulation().prepare(recording)) is None
+    assert restarted(simulation(), recording) is None
 
 
-@pytest.mark.slow
-def test_friction_of_a_chaotic_oscillator_is_found_with_restarts():
+@pytest.mark.e2e
+def test_friction_of_a_chaotic_oscillator_is_found_with_restarts_and_these_are_stated():
     few = [effect for effect in CATALOGUE if effect.id in ("coulomb_friction", "linear_drag", "constant_force")]
-    found = diagnose(Duffing(), duffing_recording(0), effects=few, surrogates=19)
+    recording = duffing_recording(0, 400)
+    again = restarted(Duffing(), recording, few)
+    assert again is not None
+    found = with_restarts_stated(diagnose(again.simulation, recording, effects=few, surrogates=19), again)
     assert found.findings[0].effect == "coulomb_friction"
     assert found.findings[0].parameters[0].value == pytest.approx(0.15, rel=0.1)
     seconds = found.environment.restart_after
-    assert seconds is not None
+    assert seconds == again.simulation.restart_after
     assert f"restarted every {seconds:.4g} s" in found.warnings[0]
     assert json.loads(diagnosis_to_json(found))["search"]["restart_after"] == seconds
     assert f"restart_after = {seconds!r}" in found.model.to_python("shakers")
+
+
+def test_restarts_of_the_user_have_precedence():
+    recording = duffing_recording(0, 100)
+    own = Duffing().with_restarts(2.0)
+    assert restarted(own, recording) is None
