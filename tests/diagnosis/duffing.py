@@ -21,10 +21,9 @@ class Duffing(Dynamics):
         "stiffness": Parameter(0.9, lower=0.1),
         "damping": Parameter(0.2, lower=0.0),
     }
-    sign = 1.0
 
     def derivative(self, time, x, u, p):
-        force = self.sign * u.shaking + p.pull * x.deflection - p.stiffness * x.deflection**3 - p.damping * x.speed
+        force = u.shaking + p.pull * x.deflection - p.stiffness * x.deflection**3 - p.damping * x.speed
         return {"deflection": x.speed, "speed": force}
 
 
@@ -44,7 +43,7 @@ def duffing_recording(seed=0, N=600, *, friction=0.15, noise=0.02, unrelated=Fal
         N: number of samples.
         friction: deceleration by dry friction in m/s².
         noise: standard deviation in m and m/s.
-        unrelated: whether the outputs are those of a recording with another seed.
+        unrelated: whether the outputs are smooth random series.
     """
     random = np.random.default_rng(seed)
     time, phase = STEP * np.arange(N), random.uniform(0.0, 6.0)
@@ -56,8 +55,8 @@ def duffing_recording(seed=0, N=600, *, friction=0.15, noise=0.02, unrelated=Fal
 
     solved = solve_ivp(rates, (0.0, time[-1]), [0.3, 0.0], t_eval=time, rtol=1e-8, atol=1e-9, max_step=STEP).y
     if unrelated:
-        other = duffing_recording(seed + 1, N, friction=friction, noise=0.0)
-        solved = np.stack([other["deflection"].numpy(), other["speed"].numpy()])
+        kernel = np.exp(-0.5 * (np.arange(-15, 16) / 5.0) ** 2)
+        solved = np.stack([np.convolve(random.standard_normal(N), kernel, "same") for _ in range(2)])
     deflection, speed = solved + noise * random.standard_normal((2, N))
     columns = {"time": time, "shaking": shaking, "deflection": deflection, "speed": speed}
     return Recording({name: torch.as_tensor(values.copy()) for name, values in columns.items()})

@@ -1,0 +1,40 @@
+"""A sensor's clock of another rate, and an input that acts a row late, on a driven mass."""
+
+import pytest
+
+from mkc_torch import diagnose
+from mkc_torch.diagnosis.findings.one_row import rows_late
+from mkc_torch.diagnosis.parts import EffectParameter
+from tests.diagnosis.clocks import STEP, Stage, stage_recording
+
+
+@pytest.mark.e2e
+def test_a_fast_clock_of_the_sensor_is_found():
+    found = diagnose(Stage(), stage_recording(1, rate=-0.003), surrogates=19, max_findings=1)
+    assert [finding.effect for finding in found.findings] == ["sensor_clock_drift"]
+    assert found.findings[0].parameters[0].value == pytest.approx(-0.003, rel=0.05)
+
+
+@pytest.mark.e2e
+def test_an_input_that_acts_a_row_late_is_named_as_that():
+    found = diagnose(Stage(), stage_recording(1, late=1), surrogates=19, max_findings=1)
+    assert [finding.effect for finding in found.findings] == ["input_delay"]
+    assert "acts one row late" in found.findings[0].explanation
+    assert "Shift the column `force` by one row" in found.findings[0].advice
+
+
+@pytest.mark.parametrize(
+    ("delay", "error", "share", "rows"),
+    [
+        (STEP, 0.004, 1.0, 1),
+        (-STEP, 0.004, 1.0, -1),
+        (0.9 * STEP, 0.004, 0.95, 1),
+        (2.0 * STEP, 0.004, 1.0, 0),
+        (STEP, 0.004, 0.3, 0),
+        (STEP, STEP, 1.0, 0),
+        (STEP, None, 1.0, 0),
+    ],
+)
+def test_a_delay_is_one_row_within_its_error_only(delay, error, share, rows):
+    parameters = [EffectParameter("share", share, 0.1, ""), EffectParameter("delay", delay, error, "s")]
+    assert rows_late(parameters, STEP) == rows
