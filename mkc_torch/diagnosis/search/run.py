@@ -115,9 +115,7 @@ def run_search(
         values=left.values - left.counts * added,
         counts=left.counts,
     )
-    # an autoregression would take a line for a resonance of the noise, and surrogates would repeat it
-    line = best.model.terms[-1].effect.narrowband
-    look = seen = scene.under(left.noise.spectrum if line else None)
+    look = seen = scene.under()
     p_value, beyond = (
         (any_pays(look, look.possible[:tried]), math.inf) if quick else _judged(look, tried, surrogates, generator)
     )

@@ -44,7 +44,6 @@ class Periodic(Effect):
     display_name = "periodic disturbance"
     port = "output"
     needs = ("own", "compared")
-    narrowband = True
     fitted_shape: Mapping[str, tuple[float, float]] = {"period": (1e-12, 1e12)}  # any: the grid is dense
     shape_units: Mapping[str, str] = {"period": "s"}
     equation = "δy = γ₁ cos(2π t / P) + γ₂ sin(2π t / P),  P the period"
@@ -70,12 +69,12 @@ class Periodic(Effect):
 def frequencies(time: Float[Tensor, " N"]) -> list[float]:
     """The frequencies in Hz to search, for a recording at these times in s: half its resolution apart.
 
-    Up to half of the reciprocal of the median sampling interval, or up to the largest number of frequencies.
+    They end below half of the reciprocal of the median sampling interval, or at the largest number of frequencies.
 
     Example:
         >>> grid = frequencies(torch.arange(100.0))
         >>> len(grid), round(grid[0] * 99, 3), round(grid[-1], 3)
-        (97, 1.5, 0.5)
+        (96, 1.5, 0.495)
     """
     length = float(time.max() - time.min())
     steps = time.sort().values.diff()
@@ -83,5 +82,6 @@ def frequencies(time: Float[Tensor, " N"]) -> list[float]:
     if not len(steps):
         return []
     least, step = _LEAST_PERIODS / length, 1.0 / (_PER_LENGTH * length)
-    count = int((0.5 / float(steps.median()) - least) / step + 1e-9) + 1
+    # at half of the sampling rate itself a sine may be 0 at all samples
+    count = math.ceil((0.5 / float(steps.median()) - least) / step - 1e-6)
     return [least + k * step for k in range(min(count, _MOST))]
