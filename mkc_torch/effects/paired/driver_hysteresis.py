@@ -17,8 +17,11 @@ from mkc_torch.effects.runs import first_of_runs, linear_recurrence
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-YIELDS = (0.02, 0.05, 0.1, 0.2, 0.5)
-"""Deflections at which the force yields, as shares of the largest value of the column, less its mean."""
+YIELDS = (0.02, 0.03, 0.045, 0.065, 0.09, 0.12, 0.16, 0.21, 0.28, 0.38, 0.5)
+"""Deflections at which the force yields, as shares of the largest value of the column, less its mean.
+
+Dense, because the search compares both models on this grid: a coarse one prefers the model with a point near its best.
+"""
 
 _SHORT = 1e-12
 """Path length over the yield deflection below which its exponential is replaced by its limit."""
