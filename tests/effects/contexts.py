@@ -77,7 +77,9 @@ def paired_context(effect, N=120):
     port = ports[ALL if effect.port == "outputs" else "output y"]
     assert set(effect.needs) <= set(port.parts)
     count = 0 if not effect.roles else 2 if "pair" in effect.roles else 1
-    drivers = torch.stack([torch.cos((0.7 + 0.4 * k) * time) for k in range(count)], -1) if count else time[:, None][:, :0]
+    drivers = (
+        torch.stack([torch.cos((0.7 + 0.4 * k) * time) for k in range(count)], -1) if count else time[:, None][:, :0]
+    )
     return Context(time, drivers, ("A", "m")[:count], signal, unit, names, (), port.parts, port.part_units)
 
 

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.model.fit import FULL, Effort, FittedModel, fitted
-from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.further_drivers import further_drivers
+from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import INPUT, PAIR, Driver, Drivers, Term, find_drivers, run_parallel
 from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects.base import Effect

@@ -40,7 +40,9 @@ class ModelPrior:
 
     def __init__(self, terms: Sequence[Term], prepared: PreparedSimulation, settings: NamingSettings) -> None:
         drivers = {
-            id(t.driver): t.driver for t in terms if t.driver is not None and t.driver.role not in (ANY, PAIR, "position")
+            id(t.driver): t.driver
+            for t in terms
+            if t.driver is not None and t.driver.role not in (ANY, PAIR, "position")
         }
         courses = [_unit(driver.values[:, 0]) for driver in drivers.values()]
         self._known = torch.stack(courses) if courses else prepared.time.new_zeros(0, len(prepared.time))

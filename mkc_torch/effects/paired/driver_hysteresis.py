@@ -85,9 +85,7 @@ class DriverDahl(DriverBoucWen):
         return dahl_path(context.drivers[:, 0], shape["yield_deflection"], context.runs)
 
 
-def dahl_path(
-    position: Float[Tensor, " N"], yields: float | Tensor, run: Int[Tensor, " N"]
-) -> Float[Tensor, " N"]:
+def dahl_path(position: Float[Tensor, " N"], yields: float | Tensor, run: Int[Tensor, " N"]) -> Float[Tensor, " N"]:
     """The internal state z of Dahl's model along a known path of the position, from 0 at the start of each run.
 
     Between samples the position moves one way, so z is exact: ``dz = dx − |dx| z / z₀`` is linear.

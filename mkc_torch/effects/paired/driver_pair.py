@@ -44,7 +44,8 @@ class DriverPair(GainEffect):
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         slopes = tuple(
-            Quantity(f"per_unit_{k}", 1, per(context.signal_unit, unit)) for k, unit in enumerate(context.units, start=1)
+            Quantity(f"per_unit_{k}", 1, per(context.signal_unit, unit))
+            for k, unit in enumerate(context.units, start=1)
         )
         return (*slopes, *([Quantity("at_mean", 1, context.signal_unit)] if "fixed zero" in context.parts else []))
 
