@@ -11,7 +11,7 @@ from torch import Tensor
 from mkc_torch._support.unit_text import quotient
 from mkc_torch.effects.base import GainEffect
 from mkc_torch.effects.context import Context, Shape
-from mkc_torch.effects.dynamics.bouc_wen_hysteresis import hysteretic_path
+from mkc_torch.effects.hysteresis import hysteretic_path
 from mkc_torch.effects.runs import first_of_runs, linear_recurrence
 
 if TYPE_CHECKING:
