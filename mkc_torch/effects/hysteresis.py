@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from mkc_torch.effects.runs import first_of_runs, linear_recurrence
 

@@ -36,7 +36,7 @@ class DriverFriction(GainEffect):
         >>> speed = torch.tensor([[-2.0], [0.0], [2.0]])
         >>> context = Context(torch.arange(3.0), speed, ("m/s",), torch.zeros(3, 1), "N", ("force",))
         >>> DriverFriction().change(torch.tensor([60.0]), {"width": 2.0}, context).squeeze(-1)
-        tensor([-45.6956,   0.0000,  45.6956])
+        tensor([-45.6957,   0.0000,  45.6957])
     """
 
     id = "driver_friction"
