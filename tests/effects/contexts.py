@@ -80,8 +80,11 @@ def paired_context(effect, N=120):
     ports = output_ports(names, dict.fromkeys(names, unit), unit, signal, names, names)
     port = ports[ALL if effect.port == "outputs" else "output y"]
     assert set(effect.needs) <= set(port.parts)
-    drivers = torch.cos(0.7 * time).unsqueeze(-1) if effect.roles else time.new_zeros(N, 0)
-    return Context(time, drivers, ("A",) if effect.roles else (), signal, unit, names, (), port.parts, port.part_units)
+    count = 0 if not effect.roles else 2 if "pair" in effect.roles else 1
+    drivers = (
+        torch.stack([torch.cos((0.7 + 0.4 * k) * time) for k in range(count)], -1) if count else time[:, None][:, :0]
+    )
+    return Context(time, drivers, ("A", "m")[:count], signal, unit, names, (), port.parts, port.part_units)
 
 
 def contexts_of(effect):

@@ -101,7 +101,8 @@ def test_ids_are_unchanged():
     assert tuple(effect.id for effect in ATTITUDE) == ("heading_reset",)
     assert tuple(effect.id for effect in PAIRED) == (
         "gain", "offset", "delay", "clock_drift", "backlash", "output_saturation", "gravity_sag", "offset", "delay",
-        "backlash", "gravity_sag", "driver_linear", "driver_quadratic", "driver_gain", "gain_drift",
+        "backlash", "gravity_sag", "driver_linear", "driver_quadratic", "driver_gain", "gain_drift", "driver_friction",
+        "driver_bouc_wen", "driver_dahl", "driver_pair", "periodic",
     )  # fmt: skip
     assert {effect.id for effect in DYNAMICS} >= {
         "constant_force", "linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction",
@@ -136,7 +137,7 @@ def test_optional_abilities_of_effects():
     assert {e.id for e in CATALOGUE if e.is_curve} == {"unknown"}
     assert {e.id for e in CATALOGUE if e.is_generalisation} == {
         "power_law", "hidden_lag", "hidden_mode", "gravity_sag", "driver_linear", "driver_quadratic",
-        "driver_gain",
+        "driver_gain", "driver_pair",
     }  # fmt: skip
     assert {e.id for e in SENSOR if e.continuous} == {"hard_iron_step", "offset_drift", "temperature_offset"}
     assert {e.id for e in CATALOGUE if not e.has_waveform} & {"hard_iron_step", "linear_drag", "gain"} == set()

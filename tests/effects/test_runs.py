@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from mkc_torch.effects.dynamics.bouc_wen_hysteresis import hysteretic_path
+from mkc_torch.effects.hysteresis import hysteretic_path
 from mkc_torch.effects.paired.between import shifted
 from mkc_torch.effects.runs import clamped_recurrence, linear_recurrence
 from mkc_torch.effects.waveforms import lagged, played

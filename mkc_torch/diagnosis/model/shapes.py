@@ -11,8 +11,18 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.model.fit import FULL, Effort, FittedModel, fitted
+from mkc_torch.diagnosis.model.further_drivers import further_drivers
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.term import Driver, Drivers, Term, find_drivers, input_drivers, run_parallel
+from mkc_torch.diagnosis.model.term import (
+    INPUT,
+    PAIR,
+    Driver,
+    Drivers,
+    Term,
+    find_drivers,
+    input_drivers,
+    run_parallel,
+)
 from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Shape
@@ -57,7 +67,8 @@ def candidates_of(
     """
     roles = frozenset(role for effect in effects for role in effect.roles)
     found = find_drivers(prepared.recording, simulation.columns, settings, roles, simulation.measured)
-    return found, candidate_terms(prepared, found.drivers, effects)
+    more = further_drivers(prepared, found.drivers, settings)
+    return found, candidate_terms(prepared, (*found.drivers, *more), effects)
 
 
 def candidate_terms(
@@ -167,7 +178,8 @@ def _drives(driver: Driver, effect: Effect) -> bool:
         return False
     if effect.positive_driver and not bool((driver.values + driver.reference >= 0.0).all()):
         return False
-    return driver.role in effect.roles or (bool(effect.roles) and effect.is_curve and len(driver.columns) == 1)
+    any_column = bool(effect.roles) and effect.is_curve and driver.role not in (INPUT, PAIR)
+    return driver.role in effect.roles or (any_column and len(driver.columns) == 1)
 
 
 def finer(term: Term, name: str, time: Float[Tensor, " N"], rounds: int) -> tuple[Term, ...]:

@@ -28,6 +28,12 @@ COPY = 1e-9
 ANY = "any"
 """The role of a column of unknown role."""
 
+INPUT = "input"
+"""The role of an input of a simulation without a state, for effects that state it."""
+
+PAIR = "pair"
+"""The role of two columns together."""
+
 _ROLE_OF_NAME: Mapping[str, str] = {"temperature": "temperature", "temp": "temperature", "current": "current"}
 _ROLE_OF_UNIT: Mapping[str, str] = {"°C": "temperature", "K": "temperature", "A": "current"}
 _POSITION = ("position_x", "position_y", "position_z")
@@ -39,7 +45,7 @@ class Driver:
 
     Attributes:
         columns: their names.
-        role: "temperature", "current", "position" or "any".
+        role: "temperature", "current", "position", "input", "pair" or "any".
         values: (N, k), finite, less ``reference``.
         reference: (k,), the columns' means.
         units: of the columns.
@@ -143,7 +149,7 @@ def role_of(name: str, unit: str) -> str:
 
 def _own_role(name: str, roles: frozenset[str]) -> str:
     """Return the longest role of a user's effects that the column's name begins with; empty without such a role."""
-    fitting = [role for role in roles - {ANY, "position"} if (name == role or name.startswith(f"{role}_"))]
+    fitting = [role for role in roles - {ANY, "position", INPUT, PAIR} if (name == role or name.startswith(f"{role}_"))]
     return max(fitting, key=len, default="")
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.term import ANY, Driver, Key, Term, continuous
+from mkc_torch.diagnosis.model.term import ANY, PAIR, Driver, Key, Term, continuous
 from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
 from mkc_torch.diagnosis.search.problem import CandidateSearch
 from mkc_torch.diagnosis.settings import NamingSettings, SearchSettings, Settings
@@ -40,7 +40,9 @@ class ModelPrior:
 
     def __init__(self, terms: Sequence[Term], prepared: PreparedSimulation, settings: NamingSettings) -> None:
         drivers = {
-            id(t.driver): t.driver for t in terms if t.driver is not None and t.driver.role not in (ANY, "position")
+            id(t.driver): t.driver
+            for t in terms
+            if t.driver is not None and t.driver.role not in (ANY, PAIR, "position")
         }
         courses = [_unit(driver.values[:, 0]) for driver in drivers.values()]
         self._known = torch.stack(courses) if courses else prepared.time.new_zeros(0, len(prepared.time))
@@ -56,6 +58,8 @@ class ModelPrior:
         if term.driver is not None and term.driver.role == ANY:
             follows = self._alike(term.driver.values[:, 0]) > give.alike_columns
             share += give.follower if follows else give.roleless
+        elif term.driver is not None and term.driver.role == PAIR:
+            share += give.roleless  # its columns may be of unknown role, and a pair contains each of them alone
         elif term.driver is None and term.effect.has_waveform and not term.effect.follows_signal:
             course = term.effect.waveform(term.shape, term.context(self._prepared, None))
             share += give.event if self._alike(course) > give.alike_event else 0.0

@@ -10,8 +10,11 @@ from __future__ import annotations
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.paired.clock_drift import ClockDrift
 from mkc_torch.effects.paired.delay import Delay, SeveralDelays
+from mkc_torch.effects.paired.driver_friction import DriverFriction
 from mkc_torch.effects.paired.driver_gain import DriverGain
+from mkc_torch.effects.paired.driver_hysteresis import DriverBoucWen, DriverDahl
 from mkc_torch.effects.paired.driver_linear import DriverLinear
+from mkc_torch.effects.paired.driver_pair import DriverPair
 from mkc_torch.effects.paired.driver_quadratic import DriverQuadratic
 from mkc_torch.effects.paired.gain import Gain
 from mkc_torch.effects.paired.gain_drift import GainDrift
@@ -19,6 +22,7 @@ from mkc_torch.effects.paired.gravity_sag import GravitySag, SeveralSag
 from mkc_torch.effects.paired.offset import Offset, SeveralOffsets
 from mkc_torch.effects.paired.output_backlash import OutputBacklash, SeveralBacklash
 from mkc_torch.effects.paired.output_saturation import OutputSaturation
+from mkc_torch.effects.paired.periodic import Periodic
 
 __all__ = ["PAIRED"]
 
@@ -38,5 +42,10 @@ PAIRED: tuple[Effect, ...] = (
     DriverQuadratic(),
     DriverGain(),
     GainDrift(),
+    DriverFriction(),
+    DriverBoucWen(),
+    DriverDahl(),
+    DriverPair(),
+    Periodic(),
 )
 """The candidate effects for outputs of simulations without a state."""

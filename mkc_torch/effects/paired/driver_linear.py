@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 
 class DriverLinear(GainEffect):
-    """The measured output depends linearly on a recorded column that the simulation does not use.
+    """The measured output depends linearly on a column that the simulation does not use, or uses otherwise.
 
     Simulation: adds ``b + k (x − x̄)`` to an output; without b where a parameter of the simulation shifts the output.
-    Drivers: any column.
+    Drivers: any column, inputs of the simulation too, such as the position of a spring.
     Units: k in the output's unit per unit of the column, b in the output's unit.
     Plausible: any size.
     Source: the linear response to any small disturbance.
@@ -34,7 +34,7 @@ class DriverLinear(GainEffect):
     port = "output"
     needs = ("own", "compared")
     is_generalisation = True  # with b, a plain offset is a special case
-    roles: tuple[str, ...] = ("any", "temperature", "current")
+    roles: tuple[str, ...] = ("any", "temperature", "current", "input")
     equation = "δy = b + k (x − x̄)"
     explanation = "The measured output depends linearly on this column."
     advice = "Find out how the column acts on the sensor or the system; correct with the fitted gain until then."
