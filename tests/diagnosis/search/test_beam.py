@@ -83,11 +83,11 @@ def test_a_special_case_is_preferred_to_its_general_form():
     assert best_value(beam, "coulomb_friction") > best_value(beam, "stribeck_friction")
 
 
-def test_every_model_is_fitted_and_scored_once(monkeypatch):
+def test_every_model_is_fitted_and_scored_once_for_each_hold(monkeypatch):
     scored = []
 
     def counted(fit, *others):
-        scored.append(model_key(fit.model.terms))
+        scored.append((model_key(fit.model.terms), tuple(fit.model.prepared.input_hold.items())))
         return score(fit, *others)
 
     def refused(*_):
@@ -99,7 +99,8 @@ def test_every_model_is_fitted_and_scored_once(monkeypatch):
     beam = beam_of(fit, cart_terms(fit, *NAMES))
     beam.run(fit)
     assert len(beam.models) > 4
-    assert sorted(scored) == sorted(beam.models)
+    assert len(set(scored)) == len(scored)
+    assert {key for key, _ in scored} == set(beam.models)
     assert [model.key for model in beam.models.values()] == list(beam.models)
 
 

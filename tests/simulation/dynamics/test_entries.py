@@ -61,8 +61,8 @@ class Cart(Dynamics):
 
     def derivative(self, time, x, u, p):
         s, c = torch.sin(x.angle), torch.cos(x.angle)
-        push = u.force + 0.2 * s * (0.5 * x.rotation**2 + 9.81 * c)
-        speed = push / (p.mass + 0.2 * s**2)
+        along = u.force + 0.2 * s * (0.5 * x.rotation**2 + 9.81 * c)
+        speed = along / (p.mass + 0.2 * s**2)
         return {
             "position": x.speed,
             "angle": x.rotation,
