@@ -21,7 +21,6 @@ from mkc_torch.effects.dynamics.unknown_near_ends import curve_within
 from mkc_torch.effects.kinds import kind_of
 from mkc_torch.effects.paired import PAIRED
 from mkc_torch.effects.paired.between import shifted
-from mkc_torch.effects.runs import since_start
 from mkc_torch.effects.sensor import ATTITUDE, SENSOR
 from mkc_torch.effects.share import soft_clip
 from mkc_torch.effects.waveforms import lagged, played
@@ -51,7 +50,6 @@ __all__ = [
     "lagged",
     "played",
     "shifted",
-    "since_start",
     "soft_clip",
     "travelled",
     "words_of",

@@ -27,20 +27,6 @@ def first_of_runs(run: Int[Tensor, " N"]) -> Bool[Tensor, " N"]:
     return torch.cat([torch.ones(1, dtype=torch.bool), run.diff() != 0])
 
 
-def since_start(time: Float[Tensor, " N"], run: Int[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """Time in s since the start of each sample's run.
-
-    Args:
-        time: times of the samples in s, ascending within each run.
-        run: number of each sample's run, ascending.
-
-    Example:
-        >>> since_start(torch.tensor([5.0, 6.0, 2.0, 4.0]), torch.tensor([0, 0, 1, 1]))
-        tensor([0., 1., 0., 2.])
-    """
-    return time - time[torch.searchsorted(run, run)]
-
-
 def linear_recurrence(factor: Float[Tensor, " N"], level: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
     """The recurrence ``y[k] = factor[k] y[k-1] + level[k]`` from ``y[-1] = 0``, by a parallel scan of affine maps.
 

@@ -31,7 +31,6 @@ _FROM_HERE: Mapping[str, str] = {
     "lagged(": "from mkc_torch.effects import lagged",
     "played(": "from mkc_torch.effects import played",
     "shifted(": "from mkc_torch.effects import shifted",
-    "since_start(": "from mkc_torch.effects import since_start",
     "soft_clip(": "from mkc_torch.effects import soft_clip",
     "curve_within(": "from mkc_torch.effects import curve_within",
     "travelled(": "from mkc_torch.effects import travelled",

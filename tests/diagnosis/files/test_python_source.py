@@ -80,7 +80,6 @@ PLACES = {
     "input_delay": ("input force", {"delay": 0.23}),
     "input_lag": ("input force", {"lag": 0.2}),
     "sensor_lag": ("output", {"lag": 0.17}),
-    "sensor_clock_drift": ("output", {}),
 }
 
 

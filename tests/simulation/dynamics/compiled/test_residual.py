@@ -237,7 +237,7 @@ def test_residuals_with_each_effect_match_torch(corrected):
         parameters = torch.cat([prepared.given, gamma])
         assert model._compiled is not None, term.effect.id
         # torch computes effects that link outputs of different samples
-        assert (model._compiled._traced.outputs is None) == (term.effect.id in ("sensor_lag", "sensor_clock_drift"))
+        assert (model._compiled._traced.outputs is None) == (term.effect.id == "sensor_lag")
         seen.add((term.effect.id, prepared.ports[term.port].kind or "output"))
         if prepared.answer(parameters[: model.base], model.changes(parameters)).nearby is not None:
             assert_like_torch(model, parameters, further=False)
