@@ -199,11 +199,21 @@ class BeamSearch:
         self._fit(works, fit, most)
 
     def _hold_best(self, held: set[ModelKey]) -> None:
-        """Exchange the holds of the inputs of the best model: missing physics can resemble the error of a hold."""
+        """Exchange the holds of the inputs of the best model, and if that scores higher those of all other models.
+
+        Missing physics can resemble the error of a hold, so the hold that the simulation alone prefers can be wrong.
+        """
         best = self.best
-        if best.fit.model.terms and best.key not in held:
-            held.add(best.key)
-            self.models[best.key] = self.with_best_hold(best)
+        if not best.fit.model.terms or best.key in held:
+            return
+        held.add(best.key)
+        other = self.with_best_hold(best)
+        if other is not best:
+            self._keep([other])
+            works = [
+                partial(self.with_best_hold, model) for key, model in self.models.items() if key not in held and key
+            ]
+            self._keep(run_parallel(works, best.fit.model.prepared, self.terms, "model"))
 
     def _improve(self, terms: Sequence[Term], further: Sequence[Term], expanded: set[ModelKey]) -> None:
         """Expand the best model, and exchange its effects for others of the same channels, as long as that helps."""
