@@ -33,6 +33,9 @@ _SHORTEST = 20
 _PER_STATE = 6
 """Samples for each initial state of the shortest segment, so that segments do not follow everything."""
 
+_SHIFTS = (0.11, 0.23, 0.37, 0.53, 0.71)
+"""Shares of the recording by which inputs are shifted: no multiples of one another, for inputs that repeat."""
+
 _HALVINGS = 8
 """Segment lengths that are tried at most."""
 
@@ -134,8 +137,9 @@ def segment_polynomials(
 def _best_length(simulation: Dynamics, whole: PreparedSimulation) -> float | None:
     """Return the length in s at which the least explained share is largest; None if the simulation does not follow.
 
-    It follows if that share is large, and if the recorded inputs are more likely than constant inputs: segments of a
-    simulation with wrong or unrelated inputs can follow by their initial states alone.
+    It follows if that share is large, and if the recorded inputs are more likely than constant inputs and than inputs
+    shifted in time: segments of a simulation with wrong or unrelated inputs can follow by their initial states alone,
+    and an unrelated oscillation can resemble the right one in another phase.
     """
     assert whole.dynamics is not None
     found: dict[float, tuple[float, FittedModel]] = {}
@@ -150,8 +154,10 @@ def _best_length(simulation: Dynamics, whole: PreparedSimulation) -> float | Non
     changing = [name for name in simulation.inputs if bool((whole.recording[name] != whole.recording[name][0]).any())]
     if not changing:
         return best
-    still = _fitted(simulation.with_restarts(best), whole, _with_constant(whole.recording, changing))
-    return best if still is None or found[best][1].log_likelihood > still.log_likelihood + DISTURBANCE else None
+    rivals = [_with_constant(whole.recording, changing), *(_shifted(whole.recording, changing, by) for by in _SHIFTS)]
+    fits = [_fitted(simulation.with_restarts(best), whole, rival) for rival in rivals]
+    least = found[best][1].log_likelihood - DISTURBANCE
+    return best if all(fit is None or fit.log_likelihood < least for fit in fits) else None
 
 
 def _fitted(simulation: Dynamics, whole: PreparedSimulation, recording: Recording) -> FittedModel | None:
@@ -171,6 +177,13 @@ def _explained_share(fit: FittedModel) -> float | None:
     rival = size_of(segment_polynomials(prepared.measured, prepared.time, prepared.begins, numbers))
     share = 1.0 - (size_of(fit.residual) / rival).square()
     return float(share.min()) if bool(share.isfinite().all()) else None
+
+
+def _shifted(recording: Recording, names: Sequence[str], share: float) -> Recording:
+    """Return a recording with columns shifted in time by a share of its length, their end before their start."""
+    by = int(share * len(recording))
+    columns = {name: recording[name].roll(by) if name in names else recording[name] for name in recording.names}
+    return Recording(columns, name=recording.name, units=recording.units, labels=recording.labels)
 
 
 def _with_constant(recording: Recording, names: Sequence[str]) -> Recording:

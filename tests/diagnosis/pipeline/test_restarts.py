@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from mkc_torch import diagnose
+from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions, prepare
 from mkc_torch.diagnosis.pipeline.restarts import (
@@ -62,6 +62,15 @@ def test_a_chaotic_simulation_follows_in_segments(seed):
 def test_a_wrong_simulation_does_not_follow_in_segments(simulation, unrelated):
     recording = duffing_recording(0, 400, unrelated=unrelated)
     assert restarted(simulation(), recording) is None
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_chaotic_simulation_does_not_follow_with_an_input_of_another_phase(seed):
+    recording = duffing_recording(seed, 400)
+    columns = {name: recording[name] for name in recording.names}
+    shifted = Recording({**columns, "shaking": recording["shaking"].roll(26)})
+    assert restarted(Duffing(), shifted) is None
 
 
 @pytest.mark.e2e
