@@ -73,7 +73,6 @@ class Effect(ABC):
         is_generalisation: whether named effects, such as drags or an added mass, are special cases of it; they are
             preferred where they fit as well. Default False.
         unrecorded: whether it is a waveform in time whose cause is in no column; default False.
-        narrowband: whether its waveform is a line in the spectrum; a clear line is left out of the noise's spectrum.
             Default False.
         remembers: whether its change at a moment depends on the signal at other moments; such effects act first where
             several are in series on an input or an output. Default False.
@@ -144,7 +143,6 @@ class Effect(ABC):
     is_curve: bool = False
     is_generalisation: bool = False
     unrecorded: bool = False
-    narrowband: bool = False
     remembers: bool = False
     settles: tuple[str, ...] = ()
 

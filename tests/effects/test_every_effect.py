@@ -102,7 +102,7 @@ def test_ids_are_unchanged():
     assert tuple(effect.id for effect in PAIRED) == (
         "gain", "offset", "delay", "clock_drift", "backlash", "output_saturation", "gravity_sag", "offset", "delay",
         "backlash", "gravity_sag", "driver_linear", "driver_quadratic", "driver_gain", "gain_drift", "driver_friction",
-        "driver_bouc_wen", "driver_dahl", "driver_pair", "periodic",
+        "driver_bouc_wen", "driver_dahl", "driver_pair",
     )  # fmt: skip
     assert {effect.id for effect in DYNAMICS} >= {
         "constant_force", "linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction",

@@ -1,4 +1,4 @@
-"""Physics hidden at the output of static simulations and of simulators' outputs, and recordings without any."""
+"""Physics hidden at the output of static simulations, and recordings without any."""
 
 from itertools import combinations
 
@@ -10,7 +10,7 @@ from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.model.shapes import candidates_of
 from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects import CATALOGUE
-from mkc_torch.simulation import Paired, Static
+from mkc_torch.simulation import Static
 
 TIME = 0.02 * np.arange(600)
 
@@ -67,7 +67,6 @@ HIDDEN = {
     "driver_linear": (lambda x, v: 3.0 * x, ("position",), "per_unit", 3.0, 0.4),
     "driver_dahl": (lambda x, v: 25.0 * path(x, elastic=False), ("position",), "stiffness", 25.0, 5.0),
     "driver_bouc_wen": (lambda x, v: 25.0 * path(x, elastic=True), ("position",), "stiffness", 25.0, 5.0),
-    "periodic": (lambda x, v: 2.0 * np.sin(2.0 * np.pi * TIME / 0.771 + 1.0), (), "period", 0.771, 0.006),
 }
 
 
@@ -106,18 +105,6 @@ def test_a_column_that_acts_alone_is_named_alone():
     recording = core(4, hidden=lambda temperature, bias: 0.01 * bias)
     found = diagnose(Core(), recording, surrogates=19, max_findings=1).findings[0]
     assert (found.effect, found.drivers) == ("driver_linear", ("bias",))
-
-
-@pytest.mark.e2e
-def test_a_period_is_found_next_to_a_simulated_output_with_a_gap():
-    _, speed = motion()
-    kept = (TIME < 4.0) | (TIME > 6.5)
-    force = 12.0 * speed + 2.0 * np.cos(2.0 * np.pi * TIME / 0.313) + np.random.default_rng(2).normal(0.0, 2.0, 600)
-    simulated = Recording({"time": torch.tensor(TIME), "force": torch.tensor(12.0 * speed)})
-    recording = Recording({"time": torch.tensor(TIME[kept]), "force": torch.tensor(force[kept])})
-    found = diagnose(Paired(simulated), recording, surrogates=19, max_findings=1).findings[0]
-    assert found.effect == "periodic"
-    assert {p.name: p.value for p in found.parameters}["period"] == pytest.approx(0.313, abs=0.002)
 
 
 @pytest.mark.e2e

@@ -115,10 +115,7 @@ def run_search(
         values=left.values - left.counts * added,
         counts=left.counts,
     )
-    look = scene.under()
-    if best.model.terms[-1].effect.narrowband and not quick:
-        look = _without_line(look, left.noise.spectrum, tried, surrogates, generator)
-    seen = look
+    look = seen = scene.under()
     p_value, beyond = (
         (any_pays(look, look.possible[:tried]), math.inf) if quick else _judged(look, tried, surrogates, generator)
     )
@@ -207,19 +204,6 @@ def _shows(base: FittedModel, fit: FittedModel, settings: Settings) -> bool:
     least, search = settings.noise.rejected_below, settings.search
     rejected = (base.weights < least) & (fit.weights >= least)
     return float(rejected.double().mean()) < search.hidden and bool((fit.d > search.smaller * base.d).all())
-
-
-def _without_line(
-    look: CandidateSearch, spectrum: NoiseSpectrum, tried: int, surrogates: int, generator: torch.Generator
-) -> CandidateSearch:
-    """Return the search under the noise that is left without a line, if the line is clearly beyond all surrogates.
-
-    A strong line colours the noise: an autoregression with a resonance there takes its place, and surrogates repeat it.
-    A resonance of the noise loses little by the removal of its largest sinusoid, so there the search stays as it is.
-    """
-    other = look.scene.under(spectrum)
-    _, beyond = _judged(other, tried, surrogates, generator)
-    return other if beyond > look.settings.confirmation.beyond_doubt else look
 
 
 def _judged(look: CandidateSearch, tried: int, surrogates: int, generator: torch.Generator) -> tuple[float, float]:

@@ -68,7 +68,6 @@ NEVER_HIDDEN = {
     "driver_bouc_wen": "as for the linear one",
     "driver_dahl": "as for the linear one",
     "driver_pair": "as for the linear one",
-    "periodic": "no plant has a disturbance of its own period",
     "driver_force": "as for the linear one; hidden by `tests.gate.recorded_causes`",
     "driver_exchange": "as for the force",
     "driver_rate_constant": "as for the force",
