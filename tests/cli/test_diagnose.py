@@ -90,7 +90,8 @@ def test_diagnose_writes_its_files_and_a_summary(step_diagnosis):
     validate(content)
     assert (content["recording"], content["simulation"], content["verdict"]) == (path.stem, "magnetometer", "explained")
     search = {"candidates": content["search"]["candidates"], "surrogates": 19, "seed": 5}
-    assert content["search"] == search | {"quick": False, "stopped": None, "starts": content["search"]["starts"]}
+    rest = {"quick": False, "stopped": None, "restart_after": None, "starts": content["search"]["starts"]}
+    assert content["search"] == search | rest
     first = content["findings"][0]
     assert first["effect"] == "hard_iron_step"
     assert first["onset"] == pytest.approx(9.0, abs=0.2)

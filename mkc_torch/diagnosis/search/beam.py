@@ -210,9 +210,9 @@ class BeamSearch:
         other = self.with_best_hold(best)
         if other is not best:
             self._keep([other])
-            works = [
-                partial(self.with_best_hold, model) for key, model in self.models.items() if key not in held and key
-            ]
+            others = {key: model for key, model in self.models.items() if key and key not in held}
+            held.update(others)
+            works = [partial(self.with_best_hold, model) for model in others.values()]
             self._keep(run_parallel(works, best.fit.model.prepared, self.terms, "model"))
 
     def _improve(self, terms: Sequence[Term], further: Sequence[Term], expanded: set[ModelKey]) -> None:

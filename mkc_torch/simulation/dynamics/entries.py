@@ -19,6 +19,7 @@ from mkc_torch.simulation.dynamics.varying import Acting
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.parameter import Parameter
 from mkc_torch.simulation.ports import Changes
+from mkc_torch.simulation.scattered import scattered
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -122,11 +123,10 @@ def _gains(system: Equations, known: Mapping[str, Parameter]) -> _Gains:
 
     They are taken at scattered states, of which those without finite rates are left out.
     """
-    generator = torch.Generator().manual_seed(0)
 
     def drawn(count: int) -> Tensor:
-        size = torch.rand(_PLACES, count, generator=generator, dtype=torch.float64) + 0.1
-        return torch.cat([size, -size]) if count else size.new_zeros(2 * _PLACES, 0)
+        size = scattered(_PLACES, count)
+        return torch.cat([size, -size])
 
     time, states, inputs = drawn(1)[:, 0].abs(), drawn(len(system.states)), drawn(len(system.inputs))
     p = Names(**{name: states.new_tensor(parameter.value or 1.0) for name, parameter in known.items()})

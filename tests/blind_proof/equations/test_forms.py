@@ -72,6 +72,13 @@ NEVER_HIDDEN = {
     "driver_exchange": "as for the force",
     "driver_rate_constant": "as for the force",
     "driver_input_gain": "as for the force",
+    "driver_output": "as for the linear one",
+    "driver_output_lagged": "as for the linear one",
+    "driver_output_quadratic": "as for the linear one",
+    "driver_parameter": "as for the linear one",
+    "driver_parameter_arrhenius": "as for the linear one",
+    "driver_parameter_quadratic": "as for the linear one",
+    "input_transport_delay": "no plant has a pipe",
     "gain_drift": "no plant's sensor ages",
 }
 """Effects of the catalogue that no plant could show, and why."""

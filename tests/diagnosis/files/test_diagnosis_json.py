@@ -56,7 +56,9 @@ def test_keys_are_those_of_the_format(content):
         "search", "findings", "disturbance", "remaining", "baseline", "corrected", "ceiling", "advice", "warnings",
         "notes", "rejected_intervals", "decisions",
     }  # fmt: skip
-    assert set(content["search"]) == {"candidates", "surrogates", "seed", "starts", "quick", "stopped"}
+    assert set(content["search"]) == {
+        "candidates", "surrogates", "seed", "starts", "restart_after", "quick", "stopped",
+    }  # fmt: skip
     assert set(content["findings"][0]) == {
         "effect", "grade", "drivers", "channels", "intervals", "onset", "equation", "explanation", "parameters",
         "p_value", "shape", "held_out", "held_out_note", "alternatives", "plausible", "plausibility", "advice",
