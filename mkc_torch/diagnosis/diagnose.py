@@ -13,7 +13,7 @@ from mkc_torch.diagnosis.model.suspect import texts_of
 from mkc_torch.diagnosis.optional import optional_steps
 from mkc_torch.diagnosis.pipeline.partial import PartialResult, build_result, cut_short, estimate, run_tests
 from mkc_torch.diagnosis.pipeline.prepare import Problem, SearchOptions, prepare
-from mkc_torch.diagnosis.pipeline.restarts import left_by_free_run, restarted_problem, with_restarts_stated
+from mkc_torch.diagnosis.pipeline.restarts import restarted_problem, with_restarts_stated
 from mkc_torch.diagnosis.pipeline.search import fit_baseline, stepwise_search
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.settings import Settings
@@ -119,20 +119,14 @@ def diagnose(
 def _with_or_without_restarts(
     problem: Problem, recording: Recording | Sequence[Recording], limit: float, begin: float
 ) -> Diagnosis:
-    """Return the diagnosis of the free run; if that is unfit, that with restarts, provided that it is not."""
-    known = PartialResult(problem)
+    """Return the diagnosis of the free run; if no fit of it is found, that with restarts."""
     try:
-        result = _result_of(problem, known, limit, begin)
+        return _result_of(problem, PartialResult(problem), limit, begin)
     except NoFitError:
         again = restarted_problem(problem, recording, limit, begin)
         if again is None:
             raise
         return with_restarts_stated(_result_of(again, PartialResult(again), limit, begin), again)
-    again = restarted_problem(problem, recording, limit, begin) if left_by_free_run(result, known.search) else None
-    if again is None:
-        return result
-    other = _result_of(again, PartialResult(again), limit, begin)
-    return result if other.verdict == "unfit" or other.stop is not None else with_restarts_stated(other, again)
 
 
 def _result_of(problem: Problem, known: PartialResult, limit: float, begin: float) -> Diagnosis:

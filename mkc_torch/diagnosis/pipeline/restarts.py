@@ -15,7 +15,6 @@ from mkc_torch.diagnosis.goodness_of_fit import size_of
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.pipeline.prepare import Problem, prepare
-from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.thresholds import DISTURBANCE, RESTARTED
 from mkc_torch.nonlinear import NoFitError
@@ -38,12 +37,6 @@ _SHIFTS = (0.11, 0.23, 0.37, 0.53, 0.71)
 
 _HALVINGS = 8
 """Segment lengths that are tried at most."""
-
-
-def left_by_free_run(result: Diagnosis, search: StepwiseSearch | None) -> bool:
-    """Whether a simulation does not follow in a free run, and no column's sign or unit is the reason."""
-    column = "" if search is None else search.column
-    return result.verdict == "unfit" and result.stop is None and not column
 
 
 def restarted_problem(
