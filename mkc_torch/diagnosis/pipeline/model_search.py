@@ -99,7 +99,7 @@ def search_models(
     tested = partial(_tested, search, beam=beam, base=base, options=options, generator=generator, keep=keep)
     for chain in _in_turn(beam):
         found = _in_either_way(chain, beam, tested)
-        # a simpler rival whose effects are not all significant is none
+        # the simpler model counts as a rival only if all its effects are significant
         if 0 < len(found.found) < len(chain) and beam.best.key != chain[-1].key:
             again = _in_either_way(_chain(beam.best, beam), beam, tested)
             found = again if len(again.found) > len(found.found) else found

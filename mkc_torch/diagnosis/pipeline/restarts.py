@@ -80,7 +80,7 @@ def with_restarts_stated(result: Diagnosis, problem: Problem) -> Diagnosis:
     assert isinstance(problem.simulation, Dynamics)
     seconds = problem.simulation.restart_after
     sentence = (
-        f"The simulation is restarted every {seconds:.4g} s, because its free run leaves the recording: findings are "
+        f"The simulation is restarted every {seconds:.4g} s, because no fit of its free run is found: findings are "
         "tested within these segments, and longer predictions are untested."
     )
     environment = replace(result.environment, restart_after=seconds)
