@@ -93,7 +93,7 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
         lines = [numbers.largest(p) for p in f.parameters[:_MOST_LINES]]
         lines.append("further parameters: see the report")
     if lines:
-        yield "size", "\n".join(lines)
+        yield "size", "\n".join(filter(None, [*lines, numbers.at_input(f.at_input)]))
     acts = f"; {sentences.acts_on(f)}" if f.channels else ""
     yield "where", sentences.where(f, numbers.clock_of(diagnosis.traces)) + acts
     if f.region is not None:

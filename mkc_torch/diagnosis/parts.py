@@ -59,6 +59,18 @@ class EffectParameter:
 
 
 @dataclass(frozen=True)
+class SizeAtInput:
+    """The size of an effect on a rate as a change of the input that moves this rate, in the input's unit.
+
+    ``parameters`` are the amplitudes whose unit differs from that at the rate; their errors include those of the
+    simulation's own parameters.
+    """
+
+    input: str
+    parameters: tuple[EffectParameter, ...]
+
+
+@dataclass(frozen=True)
 class Reference:
     """The reference value of a driver in an equation, its mean over the recording: T̄, Ī, x̄."""
 
@@ -192,6 +204,7 @@ class Finding:
     component is compared.
     ``clearly_better`` is True if the open-loop fit without it is clearly less likely, whatever the error of its size.
     ``p_value`` is that after the whole search; None in a quick look, which draws no surrogates.
+    ``at_input`` has the size in the unit of an input, for an effect on a rate that one input alone moves.
     ``grade`` rates the finding; ``shape`` checks its named shape, None if not checked.
     ``evidence`` has the results of the tests of evidence.
     """
@@ -223,6 +236,7 @@ class Finding:
     times_plausible: float | None = None
     shown_share: float | None = None
     clearly_better: bool = False
+    at_input: SizeAtInput | None = None
     grade: Grade = "left_out"
     shape: ShapeCheck | None = None
     evidence: tuple[EvidenceResult, ...] = ()

@@ -15,6 +15,7 @@ from mkc_torch._support.unit_text import ratio, sized, tidy
 from mkc_torch.diagnosis.environment import Curve
 from mkc_torch.diagnosis.evidence.base import gain_of
 from mkc_torch.diagnosis.findings.advice import SAME, distinguishing_state
+from mkc_torch.diagnosis.findings.at_input import size_at_input
 from mkc_torch.diagnosis.findings.regions import attributed, map_of, region_of, shares_of_runs
 from mkc_torch.diagnosis.findings.shape import FINE_POINTS, drawn_points, formulas
 from mkc_torch.diagnosis.model.fit import FittedModel
@@ -164,6 +165,7 @@ def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quic
         recurrence=term.effect.recurrence,
         location_specific=term.effect.location_specific,
         kind=kind_at(context),
+        at_input=size_at_input(final, number),
     )
 
 

@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -322,6 +322,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "equation": f.equation,
         "explanation": f.explanation,
         "parameters": [_parameter(p) for p in f.parameters],
+        **({} if f.at_input is None else {"at_input": _json(f.at_input)}),
         "p_value": f.p_value,
         "shape": None if f.shape is None else _shape(f.shape),
         "alternatives": [
@@ -369,8 +370,10 @@ def _json(value: Any) -> Any:
         return _score(value)
     if isinstance(value, HeldOut):
         return _held_out(value)
+    if isinstance(value, EffectParameter):
+        return _parameter(value)
     if is_dataclass(value) and not isinstance(value, type):
-        return _json(asdict(value))
+        return {item.name: _json(getattr(value, item.name)) for item in fields(value)}
     if isinstance(value, Mapping):
         return {key: _json(child) for key, child in value.items()}
     return [_json(child) for child in value] if isinstance(value, (list, tuple)) else value

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from mkc_torch._support.typesetting import plain, superscript
+from mkc_torch.diagnosis.parts import SizeAtInput
 from mkc_torch.diagnosis.result import CandidateScore, EffectParameter, HeldOut, Number, Traces
 from mkc_torch.report.words.numbers import decimals, number, share, size
 
@@ -208,6 +209,18 @@ def largest(parameter: EffectParameter) -> str:
         return f"{parameter_name(p)} {' '.join(measured(p.value, p.standard_error, p.unit))}"
     (sizes,) = ([abs(v) for v in row] for row in _rows(p.value))
     return f"{parameter_name(p)}, largest {_listed(p)[sizes.index(max(sizes))]}"
+
+
+def at_input(size: SizeAtInput | None) -> str:
+    """Format the size of an effect in the unit of the input that moves its rate; empty if there is none.
+
+    Example:
+        >>> at_input(SizeAtInput("torque", (EffectParameter("friction", 0.0497, 0.0003, "N m"),)))
+        'the same as friction 0.0497 ± 0.0003 N m at the input torque'
+    """
+    if size is None:
+        return ""
+    return f"the same as {'; '.join(largest(p) for p in size.parameters)} at the input {plain(size.input)}"
 
 
 def probability(value: float) -> str:

@@ -11,7 +11,7 @@ from mkc_torch.effects import is_curve
 from mkc_torch.report.diagnosis.environment import noise_lines, output_lines
 from mkc_torch.report.diagnosis.findings import acts_on, finding_name, grade, inseparable, rivals, where
 from mkc_torch.report.diagnosis.noise import noise_model, smooth_fit
-from mkc_torch.report.diagnosis.numbers import clock_of, evidence, gain, largest, probability
+from mkc_torch.report.diagnosis.numbers import at_input, clock_of, evidence, gain, largest, probability
 from mkc_torch.report.diagnosis.unseen import better, diverged, residual_of_all, residuals
 from mkc_torch.report.diagnosis.verdict import reasons
 from mkc_torch.report.words.numbers import size
@@ -99,7 +99,9 @@ def _in_short(finding: Finding, diagnosis: Diagnosis) -> Iterator[str]:
 
 def _sizes(finding: Finding, most: int) -> str:
     """Format the first parameters; empty for a curve, which its figure shows."""
-    return "" if is_curve(finding.effect) else "; ".join(largest(p) for p in finding.parameters[:most])
+    if is_curve(finding.effect):
+        return ""
+    return "; ".join(filter(None, [*(largest(p) for p in finding.parameters[:most]), at_input(finding.at_input)]))
 
 
 def _closed(sentence: str) -> str:

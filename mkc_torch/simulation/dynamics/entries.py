@@ -43,6 +43,13 @@ _PLACES = 20
 """Number of scattered states of either sign at which gains are computed."""
 
 
+class Known(Protocol):
+    """Equations with their parameters."""
+
+    system: Equations
+    known: Mapping[str, Parameter]
+
+
 class Enterable(Protocol):
     """The part of a prepared system that the gains of its inputs depend on.
 
@@ -108,11 +115,38 @@ def typical_gains(prepared: Enterable, name: str) -> dict[str, float]:
         prepared: the system with its recording, in open loop.
         name: of the input.
     """
+    typical = gain_of(prepared, name, prepared.given).abs().median(0).values
+    return dict(zip(prepared.system.states, typical.tolist(), strict=True))
+
+
+def gain_of(prepared: Enterable, name: str, theta: Float[Tensor, " p"]) -> Float[Tensor, "S n"]:
+    """The gain of an input on each rate, which is linear in it, along the guess of the states.
+
+    Args:
+        prepared: the system with its recording, in open loop.
+        name: of the input.
+        theta: the parameters.
+    """
     at, k = prepared.grid.spread(prepared.guess), prepared.system.inputs.index(name)
-    acting = prepared.acting(prepared.given, {})
+    acting = prepared.acting(theta, {})
     more = acting._replace(inputs=acting.inputs + torch.eye(acting.inputs.shape[1], dtype=at.dtype)[k])
-    once, other = (prepared.rate(prepared.given, {}, now)(at) for now in (acting, more))
-    return dict(zip(prepared.system.states, (other - once).abs().median(0).values.tolist(), strict=True))
+    once, other = (prepared.rate(theta, {}, now)(at) for now in (acting, more))
+    return other - once
+
+
+def lone_input(prepared: Known, state: str) -> str | None:
+    """The only input that moves a rate, if it moves no other rate and in proportion to itself; None if there is none.
+
+    Args:
+        prepared: the system.
+        state: whose rate it is.
+    """
+    system = prepared.system
+    gains = _gains(system, prepared.known)
+    moving = [name for name in system.inputs if _moves(gains, state, name)]
+    if len(moving) != 1 or any(_moves(gains, other, moving[0]) for other in system.states if other != state):
+        return None
+    return moving[0] if _is_steady(gains[state, moving[0]]) else None
 
 
 _Gains = Mapping[tuple[str, str], "Float[Tensor, ' S']"]

@@ -10,6 +10,7 @@ pytest.importorskip("jsonschema")
 from mkc_torch.density import ChannelTails
 from mkc_torch.diagnosis.evidence import prediction, residual_noise, timing
 from mkc_torch.diagnosis.io.diagnosis_json import DiagnosisFileError, diagnosis_to_json, json_schema, validate
+from mkc_torch.diagnosis.parts import SizeAtInput
 from mkc_torch.diagnosis.result import (
     DensityCheck,
     DriverShift,
@@ -105,17 +106,22 @@ def test_components_references_and_event_times_of_a_finding_are_written():
     changes = {
         "parameters": (parameter,), "event_times": (61.1, 77.8), "advice": "Do it.",
         "references": (Reference("current", 10.5, "A"),),
+        "at_input": SizeAtInput("torque", (EffectParameter("friction", 0.05, 0.001, "N m"),)),
     }  # fmt: skip
     said = timing.intermittency_result(True), timing.onset_result((60.9, 61.2))
     (finding,) = written(with_finding(make_diagnosis(1), *said, **changes))["findings"]
     assert finding["parameters"][0]["components"] == ["∂B_x/∂y", "∂B_x/∂z"]
     assert finding["event_times"] == [61.1, 77.8]
     assert finding["references"] == [{"column": "current", "value": 10.5, "unit": "A"}]
+    assert finding["at_input"] == {
+        "input": "torque",
+        "parameters": [{"name": "friction", "value": 0.05, "standard_error": 0.001, "unit": "N m"}],
+    }
     assert finding["advice"] == "Do it."
     assert finding["comes_and_goes"] is True
     assert finding["onset_interval"] == [60.9, 61.2]
     bare = dict.fromkeys(("event_times", "references"), ()) | {"advice": ""}
-    assert not {"event_times", "references", "advice"} & set(
+    assert not {"event_times", "references", "advice", "at_input"} & set(
         written(with_finding(make_diagnosis(1), **bare))["findings"][0]
     )
 
