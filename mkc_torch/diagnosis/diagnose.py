@@ -119,14 +119,30 @@ def diagnose(
 def _with_or_without_restarts(
     problem: Problem, recording: Recording | Sequence[Recording], limit: float, begin: float
 ) -> Diagnosis:
-    """Return the diagnosis of the free run; if no fit of it is found, that with restarts."""
+    """Return the diagnosis of the free run; where it is unfit and one with restarts explains the recording, that.
+
+    Segments can follow a simulation that is wrong, by their initial states. So if a fit of the free run is found, only
+    named physics that explains the segments replaces its verdict; a column with a wrong sign or unit explains it.
+    """
+    known = PartialResult(problem)
     try:
-        return _result_of(problem, PartialResult(problem), limit, begin)
+        result = _result_of(problem, known, limit, begin)
     except NoFitError:
         again = restarted_problem(problem, recording, limit, begin)
         if again is None:
             raise
-        return with_restarts_stated(_result_of(again, PartialResult(again), limit, begin), again)
+        return with_restarts_stated(_result_of(again, PartialResult(again), limit, begin), again, found=False)
+    wrong_column = known.search is not None and known.search.column
+    if result.verdict != "unfit" or result.stop is not None or wrong_column:
+        return result
+    again = restarted_problem(problem, recording, limit, begin)
+    if again is None:
+        return result
+    try:
+        restarted = _result_of(again, PartialResult(again), limit, begin)
+    except NoFitError:
+        return result
+    return with_restarts_stated(restarted, again, found=True) if restarted.verdict == "explained" else result
 
 
 def _result_of(problem: Problem, known: PartialResult, limit: float, begin: float) -> Diagnosis:

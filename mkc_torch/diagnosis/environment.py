@@ -42,9 +42,9 @@ class GoodnessOfFit:
         variation: robust standard deviation of the output. For the length of a vector, the standard deviation of
             readings that scatter as widely and equally in all directions.
         explained: share of the variation's square that the simulation explains; negative if it is worse than the mean.
-        noise_floor: standard deviation of the sensor's white noise; NaN if the sampling is slower than the noise.
-        floor_source: "declared" by the user, estimated from third differences of the "samples", or from the resolution
-            of the recorded numbers, "quantisation".
+        noise_floor: standard deviation of the sensor's white noise; NaN if unknown: the samples do not show it.
+        floor_source: "declared" by the user, estimated from differences of the recorded "samples", or from the
+            resolution of the recorded numbers, "quantisation".
         rmse_of_mean, rmse_of_last_value: residuals of two trivial predictions: the mean, and the previous sample.
     """
 
@@ -57,6 +57,11 @@ class GoodnessOfFit:
     floor_source: Literal["declared", "samples", "quantisation"]
     rmse_of_mean: float
     rmse_of_last_value: float
+
+    @property
+    def seen_noise(self) -> float:
+        """The noise floor; of rounded samples their resolution, because noise of that size is invisible in them."""
+        return self.noise_floor * (12.0**0.5 if self.floor_source == "quantisation" else 1.0)
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,15 @@ from torch import Tensor
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch._support.quantum import rounding_of
 from mkc_torch.diagnosis.environment import GoodnessOfFit
+from mkc_torch.diagnosis.noise.floor import white_noise
+from mkc_torch.diagnosis.thresholds import ABOVE_FLOOR
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-_SLOWER = 1e-4
-"""Share of an output's variation below which a noise floor estimated from samples is not meaningful."""
+_SMOOTHED = 1e-4
+"""Share of an output's variation below which an estimated noise floor is not that of a sensor."""
 
 _FAR = 5.0
 """Robust standard deviations from the median at which values are clipped for the mean."""
@@ -53,15 +55,16 @@ def goodness_of_fit(
     prepared: PreparedSimulation,
     residual: Float[Tensor, "N m"] | None,
     declared: Mapping[str, float],
-    floor: Sequence[float] | None,
 ) -> tuple[GoodnessOfFit, ...]:
     """Return the goodness of fit of each output.
+
+    The noise floor is declared, or that of the recorded samples, whatever the simulation: their white noise, and at
+    least the rounding of the file. It is unknown where the samples do not show it.
 
     Args:
         prepared: the simulation.
         residual: of the open-loop simulation; None if it has no finite trajectory.
         declared: known standard deviations of the outputs' white noise, by output.
-        floor: estimated standard deviations of the white noise; None to estimate them from third differences.
     """
     known = prepared.measured
     own = known - known.median(0).values
@@ -79,9 +82,11 @@ def goodness_of_fit(
     lost = residual is None or not bool(residual.isfinite().all())
     left = variation.clone() if lost or residual is None else size_of(residual)
     rounding = rounding_of(recorded)
-    series = recorded if residual is None or lost else residual
     seen = prepared.recorded
-    estimated = _each(_white_noise_scale, series, seen) if floor is None else left.new_tensor(floor)
+    seen = seen if seen is not None and seen.shape == recorded.shape else None
+    estimated = white_noise(recorded, prepared.time, rounding, seen)
+    if _in_other_axes(prepared):
+        estimated = estimated.square().mean().sqrt().expand_as(variation)
     last = _each(_steps, recorded, seen)
     last = last.square().mean().sqrt().expand_as(last) if _in_other_axes(prepared) else last
     units = units_of(prepared)
@@ -91,11 +96,12 @@ def goodness_of_fit(
         size, source = float(estimated[k]), "samples"
         if name in declared:
             size, source = declared[name], "declared"
-        elif of_steps > size:
+        elif of_steps > 0.0 and size <= of_steps:
             size, source = of_steps, "quantisation"
         whole = float(variation[k])
-        if source != "declared" and size < _SLOWER * whole:
-            size = math.nan  # the sampling is slower than the noise, so the samples cannot show it
+        # smoothed or computed values have no sensor's noise; samples in no order of time scatter more than the noise
+        if source != "declared" and (size < _SMOOTHED * whole or float(left[k]) < size / ABOVE_FLOOR):
+            size = math.nan
         share = 0.0 if lost else 1.0 - (float(left[k]) / whole) ** 2 if whole > 0 else 0.0
         found.append(
             GoodnessOfFit(name, units[k], float(left[k]), whole, share, size, source, whole, float(last[k]))  # type: ignore[arg-type]
@@ -136,7 +142,7 @@ def _each(
     scale: Callable[[Tensor], Tensor], values: Float[Tensor, "N m"], recorded: Bool[Tensor, "N m"] | None
 ) -> Float[Tensor, " m"]:
     """Return a scale of each column at its recorded samples, which follow one another."""
-    if recorded is None or recorded.shape != values.shape:
+    if recorded is None:
         return scale(values)
     columns = zip(values.unbind(-1), recorded.unbind(-1), strict=True)
     return torch.cat([scale(column[used].unsqueeze(-1)) for column, used in columns])
@@ -145,12 +151,6 @@ def _each(
 def _steps(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
     """Return the size of the changes from sample to sample."""
     return size_of(values[1:] - values[:-1])
-
-
-def _white_noise_scale(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
-    """Return the standard deviation of the white noise from third differences."""
-    third = values[3:] - 3.0 * values[2:-1] + 3.0 * values[1:-2] - values[:-3]
-    return robust_scale(third) / 20.0**0.5
 
 
 def units_of(prepared: PreparedSimulation) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ from mkc_torch._support.quantum import rounding_of
 from mkc_torch.diagnosis.goodness_of_fit import size_of
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.settings import Settings
-from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE_RATE
+from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.draws import drawn
 from mkc_torch.simulation.dynamics.entries import typical_gains
@@ -300,7 +300,7 @@ def is_implausible(fit: FittedModel, basis: ScoreBasis) -> bool:
         change = term.effect.change(gamma, term.shape, term.context(prepared, signal))[:, 0].detach()
         usual = float(change.abs().nan_to_num(torch.inf).quantile(_USUAL))
         gains = typical_gains(prepared.open_loop(), port.channels[0]) if port.kind == ENTRY else {port.channels[0]: 1.0}
-        if any(not gain * usual <= IMPLAUSIBLE_RATE * largest[name] for name, gain in gains.items() if name in largest):
+        if any(not gain * usual <= IMPLAUSIBLE * largest[name] for name, gain in gains.items() if name in largest):
             return True
     return False
 

@@ -267,7 +267,8 @@ class EvidenceSettings(_Stage):
         correction: ratio of what the findings explain of the outputs' variation in addition, to what the simulation
             explains without them, above which signs and units are doubted: by definition, at 1 the correction is larger
             than the simulation.
-        above_floor: ratio to a declared noise floor above which a residual is more than the sensor's noise.
+        above_floor: ratio to a declared noise floor above which a residual is more than the sensor's noise, and
+        far_above_floor: to an estimated noise floor, above which a residual is not explained.
         shape_level: p-value of a free curve's gain below which a name is only the nearest in the catalogue, and
         shape_nats: the gain that the curve needs beyond Schwarz's penalty of its numbers.
         disturbed: length in seconds from which a stretch of rejected samples is warned of; shorter stretches are bursts
@@ -293,6 +294,7 @@ class EvidenceSettings(_Stage):
     useful: float = thresholds.USEFUL
     correction: float = thresholds.CORRECTION
     above_floor: float = thresholds.ABOVE_FLOOR
+    far_above_floor: float = thresholds.FAR_ABOVE_FLOOR
     shape_level: float = thresholds.SHAPE_LEVEL
     shape_nats: float = thresholds.SHAPE_NATS
     disturbed: float = 0.5

@@ -30,8 +30,9 @@ NAMELESS = 10.0
 GENERALISATION = 5.0
 """Price in nats of a form that includes named forms as special cases, as a power law includes drags. By judgement."""
 
-IMPLAUSIBLE_RATE = 10.0
-"""Multiple of a rate's largest value in the recording that no effect changes it by. By judgement."""
+IMPLAUSIBLE = 10.0
+"""Multiple of a rate's largest value in the recording that no effect changes it by, and of an effect's largest
+plausible size above which a finding is unconfirmed. By judgement: an order of magnitude."""
 
 WIDTH = 6
 """Models of the beam. By judgement: more cost time."""
@@ -79,9 +80,6 @@ where nothing is hidden and a disturbance acts, no candidate is below it in 10 o
 effect is in 18 of 28.
 """
 
-IMPLAUSIBLE_SIZE = 10.0
-"""Multiple of the plausible size above which a finding is unconfirmed. By judgement."""
-
 VISIBLE = 0.1
 """Share of the change of a sensor's vector that its compared length has to show: a small offset in random directions
 shows 1 / √3. By reasoning."""
@@ -108,6 +106,10 @@ doubted: the correction is then larger than the simulation."""
 
 ABOVE_FLOOR = 1.5
 """Ratio to a declared noise floor above which a residual is more than the sensor's noise. By judgement."""
+
+FAR_ABOVE_FLOOR = 10.0
+"""Ratio to the white noise of the recorded samples, or to their resolution, above which a residual is not explained. By
+judgement: at most a hundredth of its square is then noise."""
 
 MUCH_REJECTED = 1.0 / 3.0
 """Share of rejected samples from which a diagnosis is doubtful. By judgement."""

@@ -45,6 +45,13 @@ EXPLAINS_MORE = "simulation_explains_more"
 TOO_FEW = "enough_samples"
 """Rule that the samples suffice for a test."""
 
+_NOISE = {
+    "declared": "declared noise of the sensor",
+    "samples": "noise of its samples",
+    "quantisation": "resolution of its samples",
+}
+"""What a residual is compared with, by the source of the noise floor."""
+
 _RESERVATIONS: Mapping[str, DiagnosisDoubt] = {"smaller_residual": "not_better", "few_rejected": "much_rejected"}
 """Doubt of each rule that leaves the verdict unchanged."""
 
@@ -158,7 +165,7 @@ def _on_all(
     yield _disturbed_state(known, findings=findings)
     text = " ".join(left.structure) or "The findings leave no structure."
     yield _decision("structure_left", len(left.structure), 0.0, passed=not left.structure, sentence=text)
-    yield from _above_declared_noise(known.corrected if findings else known.follows, settings)
+    yield from _above_noise(known, settings, findings=findings)
     if left.stop is not None:
         text = "The search was stopped: the rest of it might have found more."
         yield _decision("stopped", left.stop.seconds, 0.0, passed=False, sentence=text)
@@ -197,14 +204,32 @@ def _disturbed_state(known: FitAssessment, *, findings: bool) -> Decision:
     return _decision("disturbed_state", len(counted), 0.0, passed=not counted, sentence=text)
 
 
-def _above_declared_noise(fits: Sequence[GoodnessOfFit], settings: EvidenceSettings) -> Iterator[Decision]:
-    declared = [fit for fit in fits if fit.floor_source == "declared"]
-    if not declared:
-        return
-    above = [fit for fit in declared if fit.residual > settings.above_floor * fit.noise_floor]
-    ratio = max(fit.residual / fit.noise_floor if fit.noise_floor > 0.0 else math.inf for fit in declared)
-    text = f"The residual is {ratio:.3g} times the declared noise of the sensor."
-    yield _decision("above_declared_noise", ratio, settings.above_floor, passed=not above, sentence=text)
+def _above_noise(known: FitAssessment, settings: EvidenceSettings, *, findings: bool) -> Iterator[Decision]:
+    """Compare the residuals with the outputs' noise: declared, and, for differential equations, seen in the samples.
+
+    The noise seen in the samples is known less well. A sensor's own slow error is noise too.
+    """
+    fits = known.corrected if findings else known.follows
+    floors = [fit for fit in fits if math.isfinite(fit.noise_floor)]
+    declared = [(fit, fit.noise_floor) for fit in floors if fit.floor_source == "declared"]
+    yield from _worst("above_declared_noise", declared, settings.above_floor)
+    if known.noise is not None:
+        slow = [disturbance for disturbance in known.noise.selected.disturbances if not disturbance.at_rate]
+        seen = [
+            (fit, math.hypot(fit.seen_noise, *(error.size for error in slow if error.place == fit.output)))
+            for fit in floors
+            if fit.floor_source != "declared"
+        ]
+        yield from _worst("above_estimated_noise", seen, settings.far_above_floor)
+
+
+def _worst(rule: str, noise: Sequence[tuple[GoodnessOfFit, float]], most: float) -> Iterator[Decision]:
+    """Compare the largest ratio of a residual to its noise with the largest allowed."""
+    ratios = [(fit.residual / size if size > 0.0 else math.inf, fit) for fit, size in noise]
+    if ratios:
+        ratio, worst = max(ratios, key=lambda pair: pair[0])
+        text = f"The open-loop residual of `{worst.output}` is {ratio:.3g} times the {_NOISE[worst.floor_source]}."
+        yield _decision(rule, ratio, most, passed=ratio <= most, sentence=text)
 
 
 def reservations_of(diagnosis: Diagnosis) -> tuple[Decision, ...]:

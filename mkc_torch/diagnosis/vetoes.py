@@ -18,7 +18,7 @@ from mkc_torch.diagnosis.decisions import Decision
 from mkc_torch.diagnosis.environment import Grade
 from mkc_torch.diagnosis.held_out_gain import better_on_average, change, confirmation, mean_ratio
 from mkc_torch.diagnosis.parts import Finding, HeldOut
-from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE_SIZE, LEVEL, SMALL, VISIBLE
+from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE, LEVEL, SMALL, VISIBLE
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def size_plausible(finding: Finding, context: VetoContext) -> Decision | None:
         return None
     text = finding.plausibility or f"Its size is {times:.2g} of the largest plausible size."
     return _decision(
-        "size_plausible", finding, context, times, IMPLAUSIBLE_SIZE, passed=not finding.cannot_be, sentence=text
+        "size_plausible", finding, context, times, IMPLAUSIBLE, passed=not finding.cannot_be, sentence=text
     )
 
 

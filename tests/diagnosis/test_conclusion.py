@@ -24,7 +24,7 @@ from tests.diagnosis.factory import make_diagnosis, make_goodness_of_fit
 
 ON_ALL = (
     UNFIT, "each_output", EXPLAINS_MORE, "white_residual", "disturbed_state", "structure_left", "above_declared_noise",
-    "stopped", "few_rejected", "smaller_residual",
+    "above_estimated_noise", "stopped", "few_rejected", "smaller_residual",
 )  # fmt: skip
 ON_FINDING = tuple(veto.__name__ for veto in VETOES)
 SIGNS = "The simulation explains 12 %, the correction 71 %: check signs and units first."

@@ -24,12 +24,12 @@ def randn(*size, seed=0):
 def prepared_stub(measured, channels=("angle",), unit="rad"):
     recording = SimpleNamespace(names=channels)
     return SimpleNamespace(
-        measured=measured, channels=channels, unit=unit, ports={}, recording=recording, recorded=None
+        measured=measured, channels=channels, unit=unit, ports={}, recording=recording, recorded=None, time=TIME
     )
 
 
-def fit_of(measured, residual, declared=None, floor=None, **more):
-    return goodness_of_fit(prepared_stub(measured, **more), residual, declared or {}, floor)
+def fit_of(measured, residual, declared=None, **more):
+    return goodness_of_fit(prepared_stub(measured, **more), residual, declared or {})
 
 
 def test_the_size_of_normal_noise_is_its_standard_deviation():
@@ -69,7 +69,7 @@ def test_each_output_has_its_own_sizes_and_unit():
     port = Port(("angle", "speed"), "", carries=("angle", "speed"), parts={k: k for k in parts}, part_units=parts)
     prepared = prepared_stub(torch.cat([WAVE, 100.0 * WAVE], -1), ("angle", "speed"), "")
     prepared.ports = {"output": port}
-    fit, other = goodness_of_fit(prepared, torch.cat([0.7 * WAVE, 10.0 * WAVE], -1), {}, None)
+    fit, other = goodness_of_fit(prepared, torch.cat([0.7 * WAVE, 10.0 * WAVE], -1), {})
     assert (fit.output, fit.unit, other.output, other.unit) == ("angle", "rad", "speed", "rad/s")
     assert fit.explained == pytest.approx(0.51, abs=0.01)
     assert other.explained == pytest.approx(0.99, abs=0.01)
@@ -77,35 +77,38 @@ def test_each_output_has_its_own_sizes_and_unit():
     assert poor_fits((fit, other), 0.6) == (fit,)
 
 
-def test_the_floor_is_estimated_from_third_differences():
-    fit = fit_of(WAVE, WAVE + 0.02 * randn(N, 1))[0]
-    assert fit.floor_source == "samples"
-    assert fit.noise_floor == pytest.approx(0.02, rel=0.1)
-
-
-def test_a_given_floor_is_used():
-    fit = fit_of(WAVE, 0.02 * randn(N, 1), floor=[0.007])[0]
-    assert (fit.noise_floor, fit.floor_source) == (pytest.approx(0.007), "samples")
+def test_the_floor_is_that_of_the_recorded_samples_whatever_the_residual():
+    measured = WAVE + 0.02 * randn(N, 1)
+    for residual in (0.02 * randn(N, 1), 2.0 * WAVE, 30.0 * WAVE.cumsum(0)):
+        fit = fit_of(measured, residual)[0]
+        assert fit.floor_source == "samples"
+        assert fit.noise_floor == pytest.approx(0.02, rel=0.1)
 
 
 def test_coarse_quantisation_sets_the_floor():
-    fit = fit_of((WAVE * 20.0).round() / 20.0, 0.3 * WAVE, floor=[1e-4])[0]
+    fit = fit_of((WAVE * 20.0).round() / 20.0, 0.3 * WAVE)[0]
     assert fit.floor_source == "quantisation"
     assert fit.noise_floor == pytest.approx(0.05 / 12.0**0.5)
+    assert fit.seen_noise == pytest.approx(0.05)
 
 
 def test_fine_quantisation_does_not_set_the_floor():
-    fit = fit_of((WAVE * 20.0).round() / 20.0, 0.3 * WAVE, floor=[0.1])[0]
-    assert (fit.noise_floor, fit.floor_source) == (pytest.approx(0.1), "samples")
+    fit = fit_of(((WAVE + 0.1 * randn(N, 1)) * 20.0).round() / 20.0, 0.3 * WAVE)[0]
+    assert (fit.noise_floor, fit.floor_source) == (pytest.approx(0.1, rel=0.06), "samples")
+    assert fit.seen_noise == fit.noise_floor
 
 
 def test_a_declared_floor_overrides_estimates():
-    measured = (torch.cat([WAVE, WAVE], -1) * 20.0).round() / 20.0
-    fit, other = fit_of(
-        measured, 0.3 * randn(N, 2), {"rate": 0.001}, floor=[0.1, 0.1], channels=("angle", "rate"), unit=""
-    )
-    assert (fit.noise_floor, fit.floor_source) == (pytest.approx(0.1), "samples")
+    measured = torch.cat([WAVE, WAVE], -1) + 0.1 * randn(N, 2)
+    fit, other = fit_of(measured, 0.3 * randn(N, 2), {"rate": 0.001}, channels=("angle", "rate"), unit="")
+    assert (fit.noise_floor, fit.floor_source) == (pytest.approx(0.1, rel=0.1), "samples")
     assert (other.noise_floor, other.floor_source) == (0.001, "declared")
+
+
+def test_the_floor_of_samples_in_no_order_of_time_is_unknown():
+    """A static model of a shuffled table: its samples scatter far more than its residual."""
+    shuffled = WAVE[torch.randperm(N, generator=torch.Generator().manual_seed(0))]
+    assert math.isnan(fit_of(shuffled, 0.01 * randn(N, 1))[0].noise_floor)
 
 
 def test_residuals_of_trivial_predictions():
@@ -151,13 +154,13 @@ def test_an_output_of_unknown_share_is_a_poor_fit():
 
 def test_the_floor_is_at_least_the_quantisation():
     rounded = ((20.0 + 5.0 * WAVE + 0.001 * randn(N, 1)) * 10.0).round() / 10.0
-    fit = fit_of(rounded, 0.3 * WAVE, floor=[0.002])[0]
+    fit = fit_of(rounded, 0.3 * WAVE)[0]
     assert (fit.noise_floor, fit.floor_source) == (pytest.approx(0.1 / 12.0**0.5), "quantisation")
 
 
-def test_a_floor_below_the_resolution_of_the_sampling_is_unknown():
-    assert math.isnan(fit_of(WAVE, 0.3 * WAVE, floor=[1e-6])[0].noise_floor)
-    assert fit_of(WAVE, 0.3 * WAVE, {"angle": 1e-6}, floor=[1e-6])[0].noise_floor == 1e-6
+def test_the_floor_of_computed_values_is_unknown():
+    assert math.isnan(fit_of(WAVE, 0.3 * WAVE)[0].noise_floor)
+    assert fit_of(WAVE, 0.3 * WAVE, {"angle": 1e-6})[0].noise_floor == 1e-6
 
 
 def test_pooled_shares_count_negative_shares_as_zero():

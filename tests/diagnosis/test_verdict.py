@@ -74,12 +74,30 @@ def test_structure_colour_disturbance_or_residual_above_the_floor_is_unexplained
     assert verdict(corrected, FIRST, **changes) == "unexplained"
 
 
-def test_only_declared_floors_limit_the_residual():
+def test_declared_floors_limit_the_residual():
     assert verdict(assessed(make_goodness_of_fit(residual=0.0074))) == "adequate"
     assert verdict(assessed(make_goodness_of_fit(residual=0.0076))) == "unexplained"
     assert verdict(assessed(make_goodness_of_fit(residual=0.0076)), above_floor=2.0) == "adequate"
-    for source in ("samples", "quantisation"):
-        assert verdict(assessed(make_goodness_of_fit(residual=0.0076, floor_source=source))) == "adequate"
+
+
+@pytest.mark.parametrize(("source", "step"), [("samples", 1.0), ("quantisation", 12.0**0.5)])
+def test_a_residual_of_ten_times_the_noise_of_the_samples_is_unexplained(source, step):
+    def left(times):
+        fit = make_goodness_of_fit(residual=times * step * 0.005, explained=0.9, floor_source=source)
+        return verdict(assessed(fit, noise=noise())), verdict(
+            assessed(GOOD_FIT, corrected=(fit,), noise=noise()), FIRST
+        )
+
+    assert left(9.9) == ("adequate", "explained")
+    assert left(10.1) == ("unexplained", "unexplained")
+
+
+def test_a_slow_error_of_the_sensor_and_static_simulations_have_no_noise_of_the_samples_alone():
+    far = make_goodness_of_fit(residual=0.06, explained=0.9, floor_source="samples")
+    slow = noise(Disturbance("angle", False, 1.0, 0.03))
+    assert verdict(assessed(GOOD_FIT, corrected=(far,), noise=noise()), FIRST) == "unexplained"
+    assert verdict(assessed(GOOD_FIT, corrected=(far,), noise=slow), FIRST) == "explained"
+    assert verdict(assessed(GOOD_FIT, corrected=(far,)), FIRST) == "explained"
 
 
 def test_with_findings_the_floor_limits_the_corrected_residual():

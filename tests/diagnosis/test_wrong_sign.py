@@ -61,7 +61,7 @@ def assessed():
     model = JointModel(prepared, (straight,))
     start = torch.cat([alone.parameters, alone.parameters.new_full((1,), 0.8)])
     corrected = fitted(model, start)
-    fits = [goodness_of_fit(prepared, fit.residual, {}, None) for fit in (alone, corrected)]
+    fits = [goodness_of_fit(prepared, fit.residual, {}) for fit in (alone, corrected)]
     return FitAssessment(*fits, None)
 
 

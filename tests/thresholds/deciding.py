@@ -57,7 +57,7 @@ def _in_addition(threshold: float, factor: float) -> float:
 RULES = {
     "p_value": Rule("LEVEL", at_most=True),
     "open_loop": Rule("SMALL", True, _around_one),
-    "size_plausible": Rule("IMPLAUSIBLE_SIZE", at_most=True),
+    "size_plausible": Rule("IMPLAUSIBLE", at_most=True),
     "shape": Rule("SHAPE_NATS", True, _in_addition),
     "visible": Rule("VISIBLE", at_most=False),
     "residual_reduction": Rule("SMALL", at_most=False),
@@ -65,6 +65,7 @@ RULES = {
     "each_output": Rule("FOLLOWED", at_most=False),
     "simulation_explains_more": Rule("CORRECTION", at_most=True),
     "above_declared_noise": Rule("ABOVE_FLOOR", at_most=True),
+    "above_estimated_noise": Rule("FAR_ABOVE_FLOOR", at_most=True),
 }
 """The rules that compare a number of the trail with a threshold, by id."""
 
@@ -77,6 +78,7 @@ FIELDS = {
     "USEFUL": ("evidence", "useful"),
     "CORRECTION": ("evidence", "correction"),
     "ABOVE_FLOOR": ("evidence", "above_floor"),
+    "FAR_ABOVE_FLOOR": ("evidence", "far_above_floor"),
     "SHAPE_LEVEL": ("evidence", "shape_level"),
     "SHAPE_NATS": ("evidence", "shape_nats"),
 }

@@ -24,7 +24,7 @@ from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import Alternative, EffectParameter, Finding, Number, Reference, Separability
 from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.diagnosis.search.run import SearchResult
-from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE_SIZE
+from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE
 from mkc_torch.effects.context import Context
 from mkc_torch.effects.kinds import kind_at
 from mkc_torch.simulation.protocol import PreparedSimulation
@@ -62,7 +62,7 @@ def far_from_plausible(term: Term, gamma: Tensor, context: Context) -> str:
     if 1.0 < most < math.inf and _near(largest, most):
         return f"Its {name} ended at {sized(most, tidy(first.unit))}, the upper bound: the recording does not limit it."
     times = times_plausible(term, gamma, context)
-    if times is not None and times > IMPLAUSIBLE_SIZE:
+    if times is not None and times > IMPLAUSIBLE:
         return f"Its {name} is {times:.2g} times the largest plausible size ({term.effect.source})."
     return ""
 

@@ -169,7 +169,7 @@ def _best_open_loop(model: JointModel, starts: Sequence[Float[Tensor, " p"]]) ->
 
 def _explains(free: FittedModel) -> bool:
     """Whether an open-loop fit explains more than nothing of the recording."""
-    return pooled(goodness_of_fit(free.model.prepared, free.residual, {}, None)) > _NOTHING
+    return pooled(goodness_of_fit(free.model.prepared, free.residual, {})) > _NOTHING
 
 
 def _wider(free: FittedModel, settings: NoiseSettings) -> FittedModel:

@@ -56,8 +56,7 @@ def assess_baseline(base: ProcessNoiseFit, declared: Mapping[str, float]) -> tup
     """Return the goodness of fit of the simulation without findings, by output."""
     free = base.free
     prepared = base.fit.model.prepared if free is None else free.model.prepared
-    floor = None if base.noise is None else base.noise.selected.sensor.tolist()
-    return goodness_of_fit(prepared, None if free is None else free.residual, declared, floor)
+    return goodness_of_fit(prepared, None if free is None else free.residual, declared)
 
 
 def impossible_rotations(base: ProcessNoiseFit) -> bool:
@@ -81,8 +80,7 @@ def assess(
     corrected: tuple[GoodnessOfFit, ...] = ()
     if final.model.terms:
         free = refit_open_loop(final)
-        floor = [fit.noise_floor for fit in follows]
-        corrected = () if free is None else goodness_of_fit(free.model.prepared, free.residual, declared, floor)
+        corrected = () if free is None else goodness_of_fit(free.model.prepared, free.residual, declared)
     return FitAssessment(follows, corrected, left, bool(final.model.prepared.faults))
 
 

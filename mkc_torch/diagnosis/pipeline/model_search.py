@@ -183,7 +183,7 @@ def _wrong_column(beam: BeamSearch, base: ProcessNoiseFit, options: SearchOption
 
 
 def _goodness(fit: FittedModel) -> tuple[GoodnessOfFit, ...]:
-    return goodness_of_fit(fit.model.prepared, fit.residual, {}, None)
+    return goodness_of_fit(fit.model.prepared, fit.residual, {})
 
 
 def _in_turn(beam: BeamSearch) -> list[list[Candidate]]:

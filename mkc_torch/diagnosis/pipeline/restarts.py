@@ -75,13 +75,20 @@ def restarted_problem(
     return prepare(system, recording, problem.effects, options, None, problem.progress)
 
 
-def with_restarts_stated(result: Diagnosis, problem: Problem) -> Diagnosis:
-    """Return a diagnosis that states its restarts: in its first warning, and in its environment."""
+def with_restarts_stated(result: Diagnosis, problem: Problem, *, found: bool) -> Diagnosis:
+    """Return a diagnosis that states its restarts: in its first warning, and in its environment.
+
+    Args:
+        result: of the restarted simulation.
+        problem: with the restarted simulation.
+        found: whether a fit of the free run was found.
+    """
     assert isinstance(problem.simulation, Dynamics)
     seconds = problem.simulation.restart_after
+    reason = "its free run does not follow the recording" if found else "no fit of its free run is found"
     sentence = (
-        f"The simulation is restarted every {seconds:.4g} s, because no fit of its free run is found: findings are "
-        "tested within these segments, and longer predictions are untested."
+        f"The simulation is restarted every {seconds:.4g} s, because {reason}: findings are tested within these "
+        "segments, and longer predictions are untested."
     )
     environment = replace(result.environment, restart_after=seconds)
     return replace(result, warnings=(sentence, *result.warnings), environment=environment)

@@ -32,6 +32,7 @@ _RULES: Mapping[str, str] = MappingProxyType(
         "disturbed_state": "no unrecorded disturbance",
         "structure_left": "no structure left",
         "above_declared_noise": "residual at the declared noise",
+        "above_estimated_noise": "residual near the noise of the samples",
         "stopped": "search completed",
         "few_rejected": "few rejected samples",
         "smaller_residual": "residual smaller with the findings",

@@ -38,7 +38,7 @@ def pendulum_at(recording, stiffness=9.0, damping=0.15, system=Pendulum):
 
 def reasons_for(fit):
     """Return the reasons for the poor fit of a simulation."""
-    known = goodness_of_fit(fit.model.prepared, fit.residual, {}, None)
+    known = goodness_of_fit(fit.model.prepared, fit.residual, {})
     return reasons_of([fit], known)
 
 

@@ -79,7 +79,7 @@ def test_friction_of_a_chaotic_oscillator_is_found_with_restarts_and_these_are_s
     recording = duffing_recording(0, 400)
     again = restarted(Duffing(), recording, few)
     assert again is not None
-    found = with_restarts_stated(diagnose(again.simulation, recording, effects=few, surrogates=19), again)
+    found = with_restarts_stated(diagnose(again.simulation, recording, effects=few, surrogates=19), again, found=False)
     assert found.findings[0].effect == "coulomb_friction"
     assert found.findings[0].parameters[0].value == pytest.approx(0.15, rel=0.1)
     seconds = found.environment.restart_after
