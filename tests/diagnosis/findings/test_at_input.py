@@ -87,7 +87,7 @@ def test_friction_of_a_rate_is_a_friction_of_the_force_with_the_error_of_a_fit_a
     ratio = size.standard_error / finding.parameters[0].standard_error
     assert ratio == pytest.approx(force_error / rate_error, rel=0.02)
     assert ratio < 0.99 * MASS
-    assert at_input(finding.at_input).startswith("the same as friction 0.40")
+    assert at_input(finding.at_input).startswith("the same as friction 0.3989 ± 0.0016 N at the input force")
 
 
 @pytest.mark.e2e
