@@ -13,10 +13,10 @@ import torch
 from torch import Tensor, nn
 
 from mkc_torch.diagnosis.io.python_source import SourceError, python_source
+from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.joint import in_order_of_the_chain, summed
 from mkc_torch.diagnosis.model.term import Driver, Term, context_at
 from mkc_torch.diagnosis.result import CorrectingModel
-from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context
@@ -209,15 +209,15 @@ class DiagnosedModel(CorrectingModel):
             raise ModelFileError(f"this model is damaged: {type(error).__name__} {error}.") from None
 
 
-def model_of(final: FinalEstimate, simulation: Simulation) -> DiagnosedModel:
-    """Return the model of a final fit."""
-    model = final.fit.model
-    signals = model.signals(final.fit.parameters)
+def model_of(fit: FittedModel, simulation: Simulation) -> DiagnosedModel:
+    """Return the model of a fit."""
+    model = fit.model
+    signals = model.signals(fit.parameters)
     terms = []
     for term in model.terms:
         context = term.context(model.prepared, signals.get(term.port))
         terms.append(replace(term, shape=term.effect.bind(term.shape, context)))
-    parameters = final.fit.parameters
+    parameters = fit.parameters
     of_recordings = {offset.name for offset in model.prepared.own_offsets}
     own = [k for k, name in enumerate(model.prepared.parameter_names) if name not in of_recordings]
     return DiagnosedModel(

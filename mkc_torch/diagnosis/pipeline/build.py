@@ -31,6 +31,7 @@ from mkc_torch.diagnosis.model.shapes import described
 from mkc_torch.diagnosis.model.term import Drivers, Term
 from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
 from mkc_torch.diagnosis.optional import optional
+from mkc_torch.diagnosis.pipeline.counted import counted_fit, counts, left_out_note
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.search_notes import significance
 from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Finding, Separability, Stop, Traces, notices
@@ -162,6 +163,7 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
         unfit, known, graded = True, replace(known, corrected=()), []
     findings = tuple(finding for finding, decided in graded if not is_dropped(decided))
     without_size = tuple(finding for finding, decided in graded if is_dropped(decided))
+    kept = [number for number, (finding, decided) in enumerate(graded) if counts(finding) and not is_dropped(decided)]
     diagnosis = Diagnosis(
         recording=prepared.recording.name,
         simulation=prepared.name,
@@ -188,11 +190,11 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
             *(_no_size(finding) for finding in without_size),
             *(doubt for finding in findings for doubt in finding.doubts),
         ),
-        notes=(*prepared.recording.notes, *notes_of(whole.drivers.warnings)),
+        notes=(*prepared.recording.notes, *notes_of(whole.drivers.warnings), *left_out_note(findings)),
         candidates=_candidates(first),
         separability=separability(first) if first else _nothing_to_separate(),
         traces=_traces(prepared, whole.drivers, case.base, final),
-        model=model_of(final, whole.simulation),
+        model=model_of(counted_fit(final.fit, whole.base.fit, kept), whole.simulation),
         checks=(*prepared.checks, *_impossible(whole)),
         evidence=answers.of_all,
         environment=_environment(whole, known, unfit=unfit),

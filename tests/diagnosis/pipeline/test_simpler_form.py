@@ -138,7 +138,7 @@ def test_an_effect_without_a_simpler_form_is_unchanged():
 def test_a_model_with_a_simpler_form_is_restored_from_json():
     recording = bodies_recording((0.2, 0.2))
     simple, _ = simplified(*fit_of(recording, EFFECTS["coupling"], start=0.1), accept_all, NamingSettings())
-    model = model_of(estimate(simple, NoiseSettings()), Bodies())
+    model = model_of(estimate(simple, NoiseSettings()).fit, Bodies())
     again = DiagnosedModel.from_json(model.to_json(), simulation=Bodies())
     torch.testing.assert_close(again(recording)["left"], model(recording)["left"])
 
