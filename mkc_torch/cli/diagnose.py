@@ -28,6 +28,7 @@ from mkc_torch.cli.console import (
 from mkc_torch.cli.diagnosis_request import (
     INPUT_HOLDS,
     LEVEL,
+    MAX_FINDINGS,
     SIMULATIONS,
     SURROGATES,
     SUSPECTED,
@@ -112,6 +113,9 @@ def diagnose(
         int | None,
         typer.Option(metavar="N", help=f"Surrogates for each p-value; default: {SURROGATES}, more at a low level."),
     ] = None,
+    max_findings: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Largest number of findings; 0 only tests for missing physics.")
+    ] = MAX_FINDINGS,
     seed: Annotated[int, typer.Option(min=0, metavar="S", help="Seed of the surrogates.")] = 0,
     quick: Annotated[
         bool,
@@ -143,6 +147,7 @@ def diagnose(
         suspect=tuple(suspect or []),
         level=_level(level),
         surrogates=_surrogates(surrogates, level, quick=quick),
+        max_findings=max_findings,
         seed=seed,
         quick=quick,
         time_limit=_time_limit(time_limit),

@@ -208,6 +208,7 @@ def _outcome(
                     recording,
                     level=request.level,
                     surrogates=request.surrogates,
+                    max_findings=request.max_findings,
                     seed=request.seed,
                     noise=request.noise,
                     input_hold=request.input_hold,

@@ -14,6 +14,7 @@ SIMULATIONS = (MAGNETOMETER,)
 INPUT_HOLDS = ("held", "linear", "smooth")
 LEVEL = 0.05
 SURROGATES = 99
+MAX_FINDINGS = 3
 
 SUSPECTED = "coulomb_friction@speed + input_lag@command"
 """An example of ``--suspect``."""
@@ -40,6 +41,7 @@ class Request:
     suspect: tuple[str, ...] = ()
     level: float = LEVEL
     surrogates: int = SURROGATES
+    max_findings: int = MAX_FINDINGS
     seed: int = 0
     quick: bool = False
     time_limit: float | None = None

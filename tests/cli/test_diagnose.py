@@ -361,6 +361,9 @@ def test_the_number_of_surrogates_follows_the_level(tmp_path, monkeypatch):
     for level, surrogates in (("0.05", 99), ("0.001", 999)):
         result = mkc("diagnose", path, "--simulation", "magnetometer", "--output", tmp_path, "--level", level)
         assert (asked[-1]["level"], asked[-1]["surrogates"]) == (float(level), surrogates)
+    assert asked[-1]["max_findings"] == 3
+    mkc("diagnose", path, "--simulation", "magnetometer", "--output", tmp_path, "--max-findings", 5)
+    assert asked[-1]["max_findings"] == 5
     assert_refused(result, "internal error (ZeroDivisionError in test_diagnose.py", "report it")
     assert not (tmp_path / "a").exists()
 

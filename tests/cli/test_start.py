@@ -80,5 +80,6 @@ def test_a_calibration_loads_no_compiler(tmp_path):
 
 def test_defaults_of_the_command_line_equal_those_of_diagnose():
     module = sys.modules["mkc_torch.diagnosis.diagnose"]
-    assert (diagnosis_request.LEVEL, diagnosis_request.SURROGATES) == (module.LEVEL, module.SURROGATES)
+    for name in ("LEVEL", "SURROGATES", "MAX_FINDINGS"):
+        assert getattr(diagnosis_request, name) == getattr(module, name)
     assert diagnosis_request.INPUT_HOLDS == prepare.BETWEEN

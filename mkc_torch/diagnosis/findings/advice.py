@@ -181,9 +181,18 @@ def _called(finding: Finding, d: Diagnosis) -> str:
 
 
 def _distinguish(finding: Finding, near: Sequence[Alternative]) -> str:
-    text = ", ".join(dict.fromkeys(f"{a.effect} ({', '.join(a.drivers)})" if a.drivers else a.effect for a in near))
-    instruction = f"To distinguish {finding.effect} from {text}, record again{_how(finding, near)}."
+    """Return what to record; an effect that is also tried elsewhere is named with its place."""
+    same = any((a.effect, a.drivers) == (finding.effect, finding.drivers) for a in near)
+    own = f"{finding.effect} on the {', '.join(finding.channels)}" if same and finding.channels else finding.effect
+    text = ", ".join(dict.fromkeys(_rival(alternative, placed=same) for alternative in near))
+    instruction = f"To distinguish {own} from {text}, record again{_how(finding, near)}."
     return f"{instruction} {near[0].distinguishing_state}".rstrip()
+
+
+def _rival(alternative: Alternative, *, placed: bool) -> str:
+    drivers = f" ({', '.join(alternative.drivers)})" if alternative.drivers else ""
+    place = f" on the {alternative.port}" if placed and alternative.port else ""
+    return f"{alternative.effect}{drivers}{place}"
 
 
 def _how(finding: Finding, near: Sequence[Alternative]) -> str:

@@ -107,7 +107,7 @@ def _of_sizes(prepared: PreparedDynamics, fit: FittedModel, ends: Sequence[str])
 
 
 def _of_trials(prepared: PreparedDynamics, fits: Sequence[FittedModel], follows: Sequence[GoodnessOfFit]) -> list[str]:
-    """Return sentences on trials that fix the fit, and on inputs that do not matter."""
+    """Return sentences on trials that fix the fit, and on inputs that explain nothing."""
     now = torch.tensor([output.residual for output in follows], dtype=fits[0].parameters.dtype)
     trials = _trials(prepared)
     sizes = run_parallel([partial(_size, trial.prepared, fits, thorough=trial.thorough) for trial in trials], prepared)
@@ -130,7 +130,8 @@ def _of_trials(prepared: PreparedDynamics, fits: Sequence[FittedModel], follows:
     for name, size in still:
         if size is not None and bool((size <= now / _MATTERS).all()):
             sentences.append(
-                f"`{name}` does not matter: held at its mean, the simulation fits {', '.join(known)} equally well."
+                f"`{name}` explains nothing in this fit: held at its mean, the residual of {', '.join(known)} is no "
+                "larger."
             )
     return sentences[:3]
 

@@ -32,8 +32,8 @@ def with_search_notes(diagnosis: Diagnosis, search: StepwiseSearch) -> Diagnosis
         )
     if search.cut:
         more.append(
-            f"There is more structure beyond the {len(search.found)} findings, the limit; raise `max_findings` to find "
-            "it."
+            f"There is more structure beyond the {len(search.found)} findings, the limit; raise `--max-findings` to "
+            "find it (`max_findings` in Python)."
         )
     return replace(diagnosis, warnings=(*diagnosis.warnings, *more))
 

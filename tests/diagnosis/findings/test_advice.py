@@ -171,6 +171,21 @@ def test_rivals_are_distinguished_according_to_the_kind_of_state(kind, how):
     )
 
 
+def test_the_same_effect_elsewhere_is_named_with_its_place():
+    made = make_diagnosis(1, samples=50)
+    rivals = (
+        Alternative("overflow", (), 0.4, False, "exchange of upper and lower"),
+        Alternative("drag", (), 0.5, False),
+    )
+    first = dataclasses.replace(
+        made.findings[0], effect="overflow", channels=("rate of upper",), drivers=(), alternatives=rivals
+    )
+    (sentence, *_) = advice_of(dataclasses.replace(made, findings=(first,)))
+    assert sentence.startswith(
+        "To distinguish overflow on the rate of upper from overflow on the exchange of upper and lower, drag, record"
+    )
+
+
 def test_advice_excludes_an_unconfirmed_finding_from_corrections():
     sentences = " ".join(advice_for(3))
     assert "Do not correct for the curve along temperature yet" in sentences
