@@ -21,6 +21,7 @@ from mkc_torch.diagnosis.evidence.held_out import scored
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.result import Region, StateMap
+from mkc_torch.simulation.dynamics.surroundings import unit_of
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -105,6 +106,9 @@ def attributed(fit: FittedModel, number: int) -> Attribution | None:
         return None
     names = port.carries or port.channels
     units = {name: port.part_units[part] for part, name in port.parts.items() if port.part_units.get(part)}
+    if prepared.dynamics is not None:
+        # inputs that are no part of the effect have units too
+        units = {name: unit_of(prepared.dynamics.system, name) for name in names} | units
     # a rate is not a state
     places = {
         name: course for name, course in zip(names, signal.unbind(-1), strict=False) if name != port.parts.get("rate")

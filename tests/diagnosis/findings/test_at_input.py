@@ -77,6 +77,7 @@ def test_friction_of_a_rate_is_a_friction_of_the_force_with_the_error_of_a_fit_a
     assert (finding.effect, finding.channels) == ("coulomb_friction", ("rate of speed",))
     assert finding.at_input is not None
     assert finding.at_input.input == "force"
+    assert (finding.region.state, finding.region.unit) in {("force", "N"), ("speed", "m/s")}
     (size,) = finding.at_input.parameters
     assert (size.name, size.unit) == ("friction", "N")
     # independent: the friction as a parameter of the equations, at the rate and at the force, by least squares
