@@ -131,8 +131,8 @@ def diagnose(
 
     For each REC, diagnosis.json, model.json (for `mkc apply`) and report.html are written; with --together, one set
     for all of them. The exit code is 0 if every recording was diagnosed, with or without findings, 1 if one was not,
-    and 3 if all were but a result is doubtful: the simulation does not fit, structure remains unexplained, no finding
-    is confirmed, the findings do not make the residual smaller, or a third of the samples was rejected.
+    and 3 if all were but a result is not usable unseen: the simulation does not fit, structure remains unexplained, no
+    finding is confirmed, the findings do not make the residual smaller, or a third of the samples was rejected.
     Ctrl-C stops the search, writes the results so far and exits with 130; a second Ctrl-C exits at once.
     """
     recordings, conversions = split_trailing_pairs(recordings, convert or [])

@@ -58,8 +58,9 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path], paths: top.R
 
 
 def _four_answers(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
-    """Yield the goodness of fit, the noise, the findings, and the unexplained rest."""
+    """Yield whether the simulation can be used, the goodness of fit, the noise, the findings, and the rest."""
     d = diagnosis
+    yield "answer", top.answer(d)
     for line in environment.output_lines(d):
         yield "fit", line
     if d.verdict == "unfit":

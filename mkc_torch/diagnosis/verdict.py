@@ -25,9 +25,15 @@ Status = Literal["good", "found", "faint", "open"]
 correcting. ``open``: a poor fit, unnamed structure, or another doubt.
 """
 
+Answer = Literal["usable", "look", "unusable"]
+"""``usable``: the simulation can be used, corrected by the findings. ``look``: a person has to look at the doubts.
+``unusable``: the simulation does not fit the recording.
+"""
+
 DiagnosisDoubt = Literal["unfit", "unexplained", "unconfirmed", "not_better", "much_rejected"]
 """``unfit``: the simulation does not fit the recording.
-``unexplained``: structure remains that no finding explains, or the search was stopped.
+``unexplained``: structure remains that no finding explains, or the search was stopped; not where only a disturbance
+remains and the open-loop residual is near the noise.
 ``unconfirmed``: every finding is unconfirmed.
 ``not_better``: the residual on held-out blocks is not smaller with the findings than without.
 ``much_rejected``: a third or more of the samples of an output were rejected.
@@ -44,6 +50,12 @@ EXPLAINS_MORE = "simulation_explains_more"
 
 TOO_FEW = "enough_samples"
 """Rule that the samples suffice for a test."""
+
+DISTURBED, DRIFTING = "disturbed_state", "drifting_output"
+"""Rules that no disturbance acts on a rate, and that no slow error is in an output."""
+
+ABOVE_DECLARED, ABOVE_SEEN = "above_declared_noise", "above_estimated_noise"
+"""Rules that the open-loop residual is near the noise that is declared, or seen in the samples."""
 
 _NOISE = {
     "declared": "declared noise of the sensor",
@@ -162,7 +174,7 @@ def _on_all(
     if known.noise is not None:
         text = "The noise model includes the residual's correlation."
     yield _decision("white_residual", left.lag, 0.0, passed=left.lag == 0, sentence=text)
-    yield _disturbed_state(known, findings=findings)
+    yield from _disturbed_states(known, findings=findings)
     text = " ".join(left.structure) or "The findings leave no structure."
     yield _decision("structure_left", len(left.structure), 0.0, passed=not left.structure, sentence=text)
     yield from _above_noise(known, settings, findings=findings)
@@ -195,32 +207,35 @@ def _explains_more(known: FitAssessment, settings: EvidenceSettings) -> Decision
     return _decision(EXPLAINS_MORE, ratio, settings.correction, passed=passed, sentence=text + end)
 
 
-def _disturbed_state(known: FitAssessment, *, findings: bool) -> Decision:
+def _disturbed_states(known: FitAssessment, *, findings: bool) -> Iterator[Decision]:
     """Count the disturbances; with a finding, a sensor's own slow error counts as noise."""
     all_of_them = () if known.noise is None else known.noise.selected.disturbances
-    counted = [disturbance for disturbance in all_of_them if disturbance.at_rate or not findings]
-    names = ", ".join(dict.fromkeys(f"`{disturbance.place}`" for disturbance in counted))
-    text = f"An unrecorded disturbance acts on {names}." if counted else "No unrecorded disturbance acts."
-    return _decision("disturbed_state", len(counted), 0.0, passed=not counted, sentence=text)
+    rates = [disturbance.place for disturbance in all_of_them if disturbance.at_rate]
+    drifting = [disturbance.place for disturbance in all_of_them if not disturbance.at_rate and not findings]
+    kinds = ((DISTURBED, rates, "unrecorded disturbance acts on"), (DRIFTING, drifting, "unexplained drift is in"))
+    for rule, places, what in kinds:
+        names = ", ".join(dict.fromkeys(f"`{place}`" for place in places))
+        text = f"An {what} {names}." if places else f"No {what} {'any rate' if rule == DISTURBED else 'any output'}."
+        yield _decision(rule, len(places), 0.0, passed=not places, sentence=text)
 
 
 def _above_noise(known: FitAssessment, settings: EvidenceSettings, *, findings: bool) -> Iterator[Decision]:
     """Compare the residuals with the outputs' noise: declared, and, for differential equations, seen in the samples.
 
-    The noise seen in the samples is known less well. A sensor's own slow error is noise too.
+    The noise seen in the samples is known less well. With a finding, a sensor's own slow error is noise too.
     """
     fits = known.corrected if findings else known.follows
     floors = [fit for fit in fits if math.isfinite(fit.noise_floor)]
     declared = [(fit, fit.noise_floor) for fit in floors if fit.floor_source == "declared"]
-    yield from _worst("above_declared_noise", declared, settings.above_floor)
+    yield from _worst(ABOVE_DECLARED, declared, settings.above_floor)
     if known.noise is not None:
-        slow = [disturbance for disturbance in known.noise.selected.disturbances if not disturbance.at_rate]
+        slow = [error for error in known.noise.selected.disturbances if findings and not error.at_rate]
         seen = [
             (fit, math.hypot(fit.seen_noise, *(error.size for error in slow if error.place == fit.output)))
             for fit in floors
             if fit.floor_source != "declared"
         ]
-        yield from _worst("above_estimated_noise", seen, settings.far_above_floor)
+        yield from _worst(ABOVE_SEEN, seen, settings.far_above_floor)
 
 
 def _worst(rule: str, noise: Sequence[tuple[GoodnessOfFit, float]], most: float) -> Iterator[Decision]:
@@ -324,9 +339,16 @@ class Conclusion:
     check: str
 
     @property
+    def answer(self) -> Answer:
+        """Whether the simulation can be used."""
+        if self.verdict == "unfit":
+            return "unusable"
+        return "look" if self.doubts else "usable"
+
+    @property
     def doubtful(self) -> bool:
         """Whether a command ends with the exit status of a doubtful result."""
-        return bool(self.doubts)
+        return self.answer != "usable"
 
     @property
     def status(self) -> Status:
@@ -335,7 +357,7 @@ class Conclusion:
             return "open"
         if "left_out" in self.grades:
             return "found"
-        return "good" if self.verdict == "adequate" else "faint"
+        return "faint" if self.grades or self.verdict == "explained" else "good"
 
     def first_advice(self, *, quick: bool = False, reasons: bool = False) -> str:
         """Return the first sentence of the advice; empty if it follows from the findings and the remaining structure.
@@ -356,21 +378,33 @@ class Conclusion:
         return "The simulation can be used within the range of this recording." if self.verdict == "adequate" else ""
 
 
-def conclude(verdict: Verdict, grades: Sequence[Grade], failed: Mapping[str, str]) -> Conclusion:
+def conclude(
+    verdict: Verdict, grades: Sequence[Grade], failed: Mapping[str, str], *, near_noise: bool = False
+) -> Conclusion:
     """Return what follows from a verdict.
 
     Args:
         verdict: of the diagnosis.
         grades: of the findings.
         failed: the sentence of each failed rule on the whole diagnosis, by its id.
+        near_noise: whether the open-loop residual is known to be near the noise of the samples.
     """
-    doubts: list[DiagnosisDoubt] = [verdict] if verdict in ("unfit", "unexplained") else []
+    left = set(failed) - set(_RESERVATIONS)
+    named = bool(grades) and set(grades) <= set(NAMED)
+    small = near_noise and left == ({DISTURBED} if named else {DRIFTING}) and (named or not grades)
+    doubts: list[DiagnosisDoubt] = [verdict] if verdict in ("unfit", "unexplained") and not small else []
     if grades and all(found == "unconfirmed" for found in grades):
         doubts.append("unconfirmed")
     doubts += [doubt for rule, doubt in _RESERVATIONS.items() if rule in failed]
     check = failed.get(EXPLAINS_MORE, "") if verdict == "unexplained" else ""
     check = f"Record longer, or more runs: {failed[TOO_FEW]}" if TOO_FEW in failed else check
     return Conclusion(verdict, tuple(grades), tuple(doubts), "stopped" in failed, check)
+
+
+def is_near_noise(trail: Trail) -> bool:
+    """Whether the open-loop residual was compared with noise, and is near it."""
+    compared = [decision.passed for decision in trail.decisions if decision.rule in (ABOVE_DECLARED, ABOVE_SEEN)]
+    return bool(compared) and all(compared)
 
 
 def conclusion_of(trail: Trail) -> Conclusion:
@@ -381,7 +415,7 @@ def conclusion_of(trail: Trail) -> Conclusion:
         >>> found.verdict, found.status, found.doubtful
         ('adequate', 'good', False)
     """
-    return conclude(verdict_of(trail), grades_of(trail), failed_rules(trail))
+    return conclude(verdict_of(trail), grades_of(trail), failed_rules(trail), near_noise=is_near_noise(trail))
 
 
 def conclusion(diagnosis: Diagnosis) -> Conclusion:
@@ -390,7 +424,8 @@ def conclusion(diagnosis: Diagnosis) -> Conclusion:
     failed = failed_rules(d.decisions) | failed_rules(Trail(decisions=reservations_of(d)))
     if d.stop is not None:
         failed["stopped"] = str(d.stop)
-    return conclude(d.verdict, [finding.grade for finding in d.findings], failed)
+    grades = [finding.grade for finding in d.findings]
+    return conclude(d.verdict, grades, failed, near_noise=is_near_noise(d.decisions))
 
 
 def _decision(rule: str, value: float | None, threshold: float, *, passed: bool, sentence: str) -> Decision:

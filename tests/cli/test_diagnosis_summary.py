@@ -165,7 +165,7 @@ def first_lines(diagnosis):
 def test_fit_noise_named_and_unexplained_come_first():
     quiet = make_diagnosis(0, simulation="Pendulum", environment=make_environment(process_noise=(), disturbance=()))
     assert first_lines(quiet).startswith(
-        "flight_07 against Pendulum The recording shows no missing physics. "
+        "flight_07 against Pendulum The recording shows no missing physics. answer usable as it is "
         "fit angle: residual 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of the variance "
         "noise The residual is the sensor's noise. Input hold: `torque` is constant between samples. named "
         "nothing unexplained nothing"
@@ -179,12 +179,13 @@ def test_process_noise_is_in_the_headline_with_its_state():
     text = first_lines(disturbed)
     assert "Pendulum Process noise acts on the rate of `rate`, and no physics in the catalogue" in text
     assert "noise Process noise on the rate of `rate`: 0.228 ± 0.021 rad/s², correlation time 0.7 s" in text
+    assert "answer look: a part of the residual has no known cause fit" in text
     assert "named nothing unexplained the rate of `rate`" in text
 
 
 def test_the_summary_of_a_poor_fit_names_no_physics():
     text = flat(summary_text(make_unfit(), width=200))
-    assert text.startswith("flight_07 against Pendulum The simulation does not fit the recording. fit angle: the")
+    assert text.startswith("flight_07 against Pendulum The simulation does not fit the recording. answer unusable: the")
     assert "explains 12 % of the variance; RMSE 0.360 rad, of the output's mean 0.350 rad" in text
     assert "why Another start reaches 0.006 rad" in text
     assert "named nothing: a simulation must fit before physics is named" in text

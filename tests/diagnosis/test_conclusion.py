@@ -17,14 +17,15 @@ from mkc_torch.diagnosis.verdict import (
     doubted_signs,
     failed_rules,
     grades_of,
+    is_near_noise,
     verdict_of,
 )
 from mkc_torch.diagnosis.vetoes import VETOES
 from tests.diagnosis.factory import make_diagnosis, make_goodness_of_fit
 
 ON_ALL = (
-    UNFIT, "each_output", EXPLAINS_MORE, "white_residual", "disturbed_state", "structure_left", "above_declared_noise",
-    "above_estimated_noise", "stopped", "few_rejected", "smaller_residual",
+    UNFIT, "each_output", EXPLAINS_MORE, "white_residual", "disturbed_state", "drifting_output", "structure_left",
+    "above_declared_noise", "above_estimated_noise", "stopped", "few_rejected", "smaller_residual",
 )  # fmt: skip
 ON_FINDING = tuple(veto.__name__ for veto in VETOES)
 SIGNS = "The simulation explains 12 %, the correction 71 %: check signs and units first."
@@ -55,7 +56,13 @@ def test_no_trail_gives_two_statements_that_contradict(trail):
     assert found == conclusion_of(Trail(decisions=trail.decisions[::-1]))
     # the verdict and its doubt, exit status and status of the headline
     assert (found.verdict == "unfit") == ("unfit" in doubts) == (UNFIT in failed)
-    assert (found.verdict == "unexplained") == ("unexplained" in doubts)
+    assert found.verdict == "unexplained" or "unexplained" not in doubts
+    assert (found.answer == "unusable") == (found.verdict == "unfit")
+    assert (found.answer == "usable") == (not doubts)
+    if found.verdict == "unexplained" and "unexplained" not in doubts:
+        # only a disturbance or a drift remains, and the residual is near the noise
+        assert set(failed) - {"few_rejected", "smaller_residual"} in ({"disturbed_state"}, {"drifting_output"})
+        assert is_near_noise(trail)
     assert found.doubtful == (found.status == "open") == bool(doubts)
     if found.verdict in ("adequate", "explained"):
         assert doubts <= {"not_better", "much_rejected"}
@@ -68,7 +75,7 @@ def test_no_trail_gives_two_statements_that_contradict(trail):
     if found.status == "found":
         assert "left_out" in found.grades
     if found.status == "good":
-        assert found.verdict == "adequate"
+        assert found.verdict == "adequate" or "drifting_output" in failed
     # the advice
     assert ("can be used" in advice) == (found.verdict == "adequate")
     assert ("Do not rely" in advice) == (found.verdict == "unfit" and not found.stopped)
@@ -83,9 +90,31 @@ def test_a_failed_rule_never_improves_the_verdict(trail, rule):
     assert better.index(verdict_of(after)) <= better.index(verdict_of(before))
 
 
+def remaining(*rules, near=True, grade=""):
+    """Return the trail of a finding, or of none, after which these rules fail."""
+    on_finding = {"left_out": (), "unconfirmed": ("open_loop",)}
+    named = [decision("p_value", finding=1), *(decision(r, passed=False, finding=1) for r in on_finding.get(grade, ()))]
+    whole = [decision(rule, passed=False) for rule in rules]
+    return Trail(decisions=(*(named if grade else ()), *whole, decision("above_estimated_noise", passed=near)))
+
+
+def test_a_disturbance_that_remains_near_the_noise_is_usable_with_named_findings_and_a_drift_without():
+    for rule, grade in (("disturbed_state", "left_out"), ("drifting_output", "")):
+        found = conclusion_of(remaining(rule, grade=grade))
+        assert (found.verdict, found.answer, found.doubts) == ("unexplained", "usable", ())
+        assert conclusion_of(remaining(rule, grade=grade, near=False)).answer == "look"
+        assert conclusion_of(remaining(rule, "structure_left", grade=grade)).answer == "look"
+        unknown = Trail(decisions=remaining(rule, grade=grade).decisions[:-1])
+        assert conclusion_of(unknown).answer == "look"
+    assert conclusion_of(remaining("disturbed_state")).answer == "look"
+    assert conclusion_of(remaining("disturbed_state", grade="unconfirmed")).answer == "look"
+    assert conclusion_of(remaining(UNFIT)).answer == "unusable"
+    assert conclusion_of(remaining()).answer == "usable"
+
+
 @pytest.mark.parametrize("failed", [(), ("few_rejected",), ("structure_left",), (UNFIT,)])
 def test_a_diagnosis_comes_to_the_conclusion_of_its_trail(failed):
-    trail = Trail(decisions=tuple(decision(rule, passed=rule not in failed) for rule in ON_ALL[:8]))
+    trail = Trail(decisions=tuple(decision(rule, passed=rule not in failed) for rule in ON_ALL[:10]))
     reserved = Trail(decisions=tuple(decision(rule, passed=False) for rule in failed if rule == "few_rejected"))
     whole = Trail(decisions=(*trail.decisions, *reserved.decisions))
     made = make_diagnosis(0, samples=50, verdict=verdict_of(whole), decisions=whole)

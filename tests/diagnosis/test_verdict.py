@@ -98,6 +98,9 @@ def test_a_slow_error_of_the_sensor_and_static_simulations_have_no_noise_of_the_
     assert verdict(assessed(GOOD_FIT, corrected=(far,), noise=noise()), FIRST) == "unexplained"
     assert verdict(assessed(GOOD_FIT, corrected=(far,), noise=slow), FIRST) == "explained"
     assert verdict(assessed(GOOD_FIT, corrected=(far,)), FIRST) == "explained"
+    # without findings a slow error can be missing physics
+    assert "above_estimated_noise" in failed_rules(trail_of(assessed(far, noise=slow)))
+    assert "above_estimated_noise" not in failed_rules(trail_of(assessed(GOOD_FIT, noise=slow)))
 
 
 def test_with_findings_the_floor_limits_the_corrected_residual():

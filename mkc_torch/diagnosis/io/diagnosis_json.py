@@ -205,6 +205,7 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "level": d.level,
         "p_value": d.p_value,
         "verdict": d.verdict,
+        "answer": conclusion(d).answer,
         "doubts": conclusion(d).doubts,
         "goodness_of_fit": goodness_of_fit_json(d.environment),
         "before_the_search": [checks_json(check) for check in d.checks],

@@ -30,6 +30,7 @@ _RULES: Mapping[str, str] = MappingProxyType(
         "simulation_explains_more": "correction at most the simulation",
         "white_residual": "residual white",
         "disturbed_state": "no unrecorded disturbance",
+        "drifting_output": "no unexplained drift of an output",
         "structure_left": "no structure left",
         "above_declared_noise": "residual at the declared noise",
         "above_estimated_noise": "residual near the noise of the samples",

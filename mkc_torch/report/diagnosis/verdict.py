@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from mkc_torch._support.typesetting import capital, plain, several
 from mkc_torch.diagnosis.result import UNFINISHED, VERDICT_SENTENCES, Diagnosis, Finding, notices
-from mkc_torch.diagnosis.verdict import Status, conclusion, doubted_signs, rejected_share
+from mkc_torch.diagnosis.verdict import DiagnosisDoubt, Status, conclusion, doubted_signs, rejected_share
 from mkc_torch.diagnosis.vetoes import is_small, transfers, worth_correcting
 from mkc_torch.report.diagnosis.findings import NOT_TESTED, finding_name, inseparable, rivals, unrecorded, with_names
 from mkc_torch.report.diagnosis.unseen import residual_of_all
@@ -38,6 +38,26 @@ class RunPaths(NamedTuple):
 def status(diagnosis: Diagnosis) -> Status:
     """Return the status of the headline."""
     return conclusion(diagnosis).status
+
+
+_LOOK: dict[DiagnosisDoubt, str] = {
+    "unexplained": "a part of the residual has no known cause",
+    "unconfirmed": "no finding is confirmed",
+    "not_better": "the findings do not make the residual smaller",
+    "much_rejected": "many samples were rejected",
+}
+"""What to look at, by doubt."""
+
+
+def answer(diagnosis: Diagnosis) -> str:
+    """Return whether the simulation can be used: usable, look or unusable, with the reason."""
+    found = conclusion(diagnosis)
+    if found.answer == "unusable":
+        return "unusable: the simulation does not follow the recording"
+    if found.answer == "look":
+        return f"look: {', '.join(_LOOK[doubt] for doubt in found.doubts if doubt in _LOOK)}"
+    corrected = any(worth_correcting(finding) for finding in diagnosis.findings)
+    return "usable, corrected by the findings" if corrected else "usable as it is"
 
 
 def headline(diagnosis: Diagnosis) -> str:

@@ -51,9 +51,8 @@ def test_diagnoses_of_every_size_are_written(findings, channels):
 
 def test_keys_are_those_of_the_format(content):
     assert set(content) == {
-        "schema", "recording", "simulation", "samples", "level", "p_value", "verdict", "doubts", "goodness_of_fit",
-        "before_the_search", "reasons",
-        "noise",
+        "schema", "recording", "simulation", "samples", "level", "p_value", "verdict", "answer", "doubts",
+        "goodness_of_fit", "before_the_search", "reasons", "noise",
         "search", "findings", "disturbance", "remaining", "baseline", "corrected", "ceiling", "advice", "warnings",
         "notes", "rejected_intervals", "decisions",
     }  # fmt: skip
