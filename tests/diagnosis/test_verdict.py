@@ -8,7 +8,7 @@ import torch
 
 from mkc_torch.diagnosis.decisions import Decision, Trail
 from mkc_torch.diagnosis.settings import EvidenceSettings
-from mkc_torch.diagnosis.verdict import FitAssessment, Remainder, decisions_on_all, grades_of, verdict_of
+from mkc_torch.diagnosis.verdict import FitAssessment, Remainder, decisions_on_all, failed_rules, grades_of, verdict_of
 from mkc_torch.simulation.dynamics.noise import StateSpaceNoise
 from mkc_torch.simulation.dynamics.noise_selection import SelectedNoise
 from mkc_torch.simulation.dynamics.observer import Disturbance

@@ -107,7 +107,7 @@ def attributed(fit: FittedModel, number: int) -> Attribution | None:
     names = port.carries or port.channels
     units = {name: port.part_units[part] for part, name in port.parts.items() if port.part_units.get(part)}
     if prepared.dynamics is not None:
-        # inputs that are no part of the effect have units too
+        # inputs that the effect does not refer to have units too
         units = {name: unit_of(prepared.dynamics.system, name) for name in names} | units
     # a rate is not a state
     places = {
