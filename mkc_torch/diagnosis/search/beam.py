@@ -264,7 +264,7 @@ class BeamSearch:
             found.setdefault(key, []).append(held)
         if noisy is not None:
             leading = {term.key for term in further}
-            led = [term for term in terms if term.key in leading]
+            led = [term for term in terms if term.key in leading and not term.effect.open_loop_only]
             for addition in additions(noisy, led, self.settings.noise):
                 found.setdefault(addition.key, []).append(partial(fitted_through_noise, noisy, *addition.starts[0]))
         return found
