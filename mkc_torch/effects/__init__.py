@@ -13,8 +13,8 @@ what differs. The tests run one common suite over every effect of the catalogue,
 from __future__ import annotations
 
 from mkc_torch.effects.base import Effect, GainEffect, in_words
-from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.clock import resampled
+from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.dynamics import DYNAMICS
 from mkc_torch.effects.dynamics.input_transport_delay import travelled
 from mkc_torch.effects.dynamics.rate import beyond
