@@ -1,4 +1,4 @@
-"""An input that acts a row late, on a driven mass."""
+"""A sensor's clock of another rate, and an input that acts a row late, on a driven mass."""
 
 import pytest
 
@@ -6,6 +6,19 @@ from mkc_torch import diagnose
 from mkc_torch.diagnosis.findings.one_row import rows_late
 from mkc_torch.diagnosis.parts import EffectParameter
 from tests.diagnosis.clocks import STEP, Stage, stage_recording
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("rate", [0.006, -0.006])
+def test_a_clock_of_another_rate_is_found_with_its_rate(rate):
+    found = diagnose(Stage(), stage_recording(1, rate=rate), surrogates=19, max_findings=1)
+    [finding] = found.findings
+    assert finding.effect == "sensor_clock_drift"
+    [parameter] = finding.parameters
+    assert parameter.unit == "%"
+    assert abs(parameter.value - 100.0 * rate) < 3.0 * parameter.standard_error < 0.02
+    words = "0.6 % fast" if rate > 0 else "0.6 % slow"
+    assert f"clock of output `position` runs {words}" in finding.explanation
 
 
 @pytest.mark.e2e
