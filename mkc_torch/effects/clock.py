@@ -61,11 +61,11 @@ def _slopes(values: Float[Tensor, " N"], time: Float[Tensor, " N"], run: Int[Ten
     """Slope at each sample of the parabola through it and its neighbours in the run; of a line through two samples."""
     if len(time) < 2:
         return torch.zeros_like(values)
-    joined, none = run.diff() == 0, torch.zeros_like(values[:1])
+    joined, none, apart = run.diff() == 0, torch.zeros_like(values[:1]), torch.zeros_like(time[:1])
     nearness = torch.where(joined, 1.0 / time.diff().abs().clamp(min=1e-300), 0.0)
     each = nearness * values.diff()
     before, after = torch.cat([none, each]), torch.cat([each, none])
-    w_before, w_after = torch.cat([none.detach(), nearness]), torch.cat([nearness, none.detach()])
+    w_before, w_after = torch.cat([apart, nearness]), torch.cat([nearness, apart])
     total = w_before + w_after
     inner = (w_before * before + w_after * after) / torch.where(total > 0.0, total, 1.0)
     # an end continues the parabola of its neighbour, if there are three samples

@@ -230,8 +230,8 @@ def is_flexible(term: Term) -> bool:
 
     A second mass or store, which is a general form too, is passive: it has an own state and a share of its own, and
     depends on no component or column by itself. It cannot reverse a sign, and a simulation without it can explain
-    little, as that of a motor with a load on a flexible shaft does. Nor can a clock, which is right at the start of each
-    run, while the free run loses a recording that is long enough.
+    little, as that of a motor with a load on a flexible shaft does. Nor can a clock, which is right at the start of
+    each run, while the free run loses a long recording.
     """
     effect = term.effect
     late = effect.remembers and not effect.open_loop_only

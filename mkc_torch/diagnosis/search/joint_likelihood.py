@@ -252,15 +252,10 @@ def _scene(
     ):
         return None
     counted = replace(flow, counts=flow.counts * counts.double().cpu().numpy())
-    free = [number for number, term in enumerate(terms) if term.effect.open_loop_only]
-    candidates = list(tangents.candidates)
-    for number, own in zip(free, open_loop_tangents(model, base.parameters, [terms[k] for k in free]), strict=True):
-        candidates[number] = own
-    moved = torch.cat([tangents.nuisance, *candidates], -1).double().cpu().numpy()
-    alone = [number in free for number, own in enumerate(candidates) for _ in range(own.shape[-1])]
+    moved, free = _with_open_loop(base, terms, tangents)
     series = SeriesAlong(flow.new[..., None], flow.shift[..., None])
     columns = Columns(
-        _along(flow, prepared, base.residual, moved, np.array([False] * model.size + alone)),
+        _along(flow, prepared, base.residual, moved, free),
         model.size,
         tuple(columns.shape[-1] for columns in tangents.candidates),
         tuple(term.effect.one_sided for term in terms),
@@ -269,6 +264,20 @@ def _scene(
     theta, changes = base.parameters[: model.base], model.changes(base.parameters)
     largest = plausible_sizes(prepared, theta, changes, model.near)
     return _LinearisedRecording(prepared, flow, counted, series, columns, largest, price)
+
+
+def _with_open_loop(
+    base: FittedModel, terms: Sequence[Term], tangents: ModelTangents
+) -> tuple[Float[np.ndarray, "N m K"], Bool[np.ndarray, " K"]]:
+    """Return the tangents of parameters and candidates, and which of them are of the open loop beside an observer."""
+    observed = base.model.prepared.observer is not None
+    alone = [observed and term.effect.open_loop_only for term in terms]
+    chosen = [term for term, is_alone in zip(terms, alone, strict=True) if is_alone]
+    found = iter(open_loop_tangents(base.model, base.parameters, chosen))
+    columns = [next(found) if is_alone else own for own, is_alone in zip(tangents.candidates, alone, strict=True)]
+    moved = torch.cat([tangents.nuisance, *columns], -1).double().cpu().numpy()
+    free = [is_alone for own, is_alone in zip(columns, alone, strict=True) for _ in range(own.shape[-1])]
+    return moved, np.array([False] * tangents.nuisance.shape[-1] + free)
 
 
 def _limits(base: FittedModel) -> Limits | None:

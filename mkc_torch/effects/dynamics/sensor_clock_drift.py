@@ -20,6 +20,9 @@ RATES = (0.05, 0.125, 0.2, 0.32, 0.5, 0.75, 1.15)
 
 _PER_CENT = 0.01
 
+_NAMED = 0.01
+"""Share of the largest rate from which the explanation names an output."""
+
 
 class SensorClockDrift(Effect):
     """The clock of an output runs at another rate than the clock of the inputs; both start together in each run.
@@ -74,10 +77,9 @@ class SensorClockDrift(Effect):
     def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
         names = [f"`{name}`" for name in context.channels]
         if len(gamma) == len(names):
-            each = [
-                f"the clock of output {name} runs {rate_in_words(rate)}"
-                for name, rate in zip(names, gamma, strict=True)
-            ]
+            least = _NAMED * max(abs(rate) for rate in gamma)
+            drifting = [(name, rate) for name, rate in zip(names, gamma, strict=True) if abs(rate) >= least]
+            each = [f"the clock of output {name} runs {rate_in_words(rate)}" for name, rate in drifting]
         else:
             each = [f"the clock of outputs {in_a_list(names)} runs {rate_in_words(gamma[0])}"]
         text = in_a_list(each)
