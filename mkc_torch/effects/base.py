@@ -78,6 +78,8 @@ class Effect(ABC):
             several are in series on an input or an output. Default False.
         settles: parameters of the clocks, "offset" or "rate", that it is equivalent to where it acts on all outputs;
             they are held at 0 while it is fitted. Default none.
+        mistaken_for: an effect outside the catalogue that a recording has to exclude before this one is named; default
+            None.
         open_loop_only: whether it is computed and fitted along the open loop only, because along a trajectory that an
             observer corrects it would read the recording ahead; default False.
 
@@ -149,6 +151,7 @@ class Effect(ABC):
     unrecorded: bool = False
     remembers: bool = False
     settles: tuple[str, ...] = ()
+    mistaken_for: Effect | None = None
     open_loop_only: bool = False
 
     lower: float = -math.inf

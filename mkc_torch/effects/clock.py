@@ -18,18 +18,21 @@ def resampled(
     time: Float[Tensor, " N"],
     rate: float | Tensor,
     run: Int[Tensor, " N"] | None = None,
+    *,
+    later: float | Tensor = 0.0,
 ) -> Float[Tensor, " N"]:
     """Values at the moments at which a clock of another rate shows the times of the samples.
 
     A clock that runs fast by ``rate`` shows ``t₀ + (1 + rate) (t − t₀)`` at t, where t₀ is the start of the run.
     Between samples the values follow cubic polynomials with the slopes of parabolas through three samples; beyond the
-    end of a run, which a slow clock reads, they continue with the slope there.
+    ends of a run, as a slow clock reads it, they continue with the slope there.
 
     Args:
         values: values at the samples.
         time: times of the samples in s, ascending within each run.
         rate: share by which the clock runs fast; negative for a slow clock; above -1.
         run: number of each sample's run, ascending; None: a run begins only where time goes back.
+        later: shift of all moments in s; negative for earlier moments.
 
     Example:
         >>> time = torch.arange(5.0)
@@ -40,21 +43,22 @@ def resampled(
     first = torch.searchsorted(run, run)
     last = torch.searchsorted(run, run, right=True) - 1
     start = time[first]
-    at = (time - start) / (1.0 + rate)
-    known = at.detach() if isinstance(at, Tensor) else at
+    at = (time - start) / (1.0 + rate) + later
     span = time.max() - time.min() + 1.0
     # times of the runs one after the other
-    left = torch.searchsorted(run * span + time - start, run * span + known.clamp(max=float(span)), right=True) - 1
+    left = (
+        torch.searchsorted(run * span + time - start, run * span + at.detach().clamp(0.0, float(span)), right=True) - 1
+    )
     left = torch.minimum(torch.maximum(left, first), torch.maximum(last - 1, first))
     right = torch.minimum(left + 1, last)
     slope = _slopes(values, time, run)
     step = (time[right] - time[left]).clamp(min=1e-300)
     share = (at - (time[left] - start)) / step
-    inside = share.clamp(max=1.0)
+    inside = share.clamp(0.0, 1.0)
     a, b, square = step * slope[left], step * slope[right], inside * inside
     rise = values[right] - values[left]
     cubic = values[left] + inside * a + square * (3.0 * rise - 2.0 * a - b) + square * inside * (a + b - 2.0 * rise)
-    return cubic + (share - inside) * b
+    return cubic + (share - inside) * torch.where(share < 0.0, a, b)
 
 
 def _slopes(values: Float[Tensor, " N"], time: Float[Tensor, " N"], run: Int[Tensor, " N"]) -> Float[Tensor, " N"]:

@@ -34,7 +34,7 @@ def stage_recording(seed, N=800, *, rate=0.0, late=0, noise=0.004):
         seed: of the force and the noise.
         N: number of samples.
         rate: share by which the clock of the sensor runs fast.
-        late: samples by which the force acts later than its column shows.
+        late: samples by which the force acts later than its column shows; negative for earlier.
         noise: standard deviation in m.
     """
     random = np.random.default_rng(seed)

@@ -22,6 +22,14 @@ def test_a_clock_of_another_rate_is_found_with_its_rate(rate):
 
 
 @pytest.mark.e2e
+def test_a_constant_offset_of_the_clocks_is_no_drift():
+    """The force acts three samples before its column shows it, which no effect of the catalogue names."""
+    found = diagnose(Stage(), stage_recording(1, late=-3), surrogates=19, max_findings=1)
+    assert found.p_value <= 0.05
+    assert "sensor_clock_drift" not in {finding.effect for finding in found.findings}
+
+
+@pytest.mark.e2e
 def test_an_input_that_acts_a_row_late_is_named_as_that():
     found = diagnose(Stage(), stage_recording(1, late=1), surrogates=19, max_findings=1)
     assert [finding.effect for finding in found.findings] == ["input_delay"]

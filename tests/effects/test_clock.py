@@ -39,6 +39,15 @@ def test_the_error_between_samples_falls_with_the_third_power_of_the_step():
     assert error(0.2) < 5e-4
 
 
+@pytest.mark.parametrize("later", [0.13, -0.13])
+def test_a_shift_is_that_of_the_signal(later):
+    time = uneven()
+    found = resampled(torch.sin(time), time, 0.0, later=later)
+    torch.testing.assert_close(found[5:-5], torch.sin(time + later)[5:-5], rtol=0.0, atol=1e-4)
+    line = resampled(1.0 - 3.0 * time, time, 0.0, later=later)
+    torch.testing.assert_close(line, 1.0 - 3.0 * (time + later))
+
+
 def test_each_run_starts_its_clock_again():
     one, other = uneven(50), uneven(30, start=1.0)
     time, run = torch.cat([one, other]), torch.cat([torch.zeros(50), torch.ones(30)]).long()

@@ -11,6 +11,7 @@ from torch import Tensor
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.clock import resampled
 from mkc_torch.effects.context import Context, Quantity, Shape
+from mkc_torch.effects.dynamics.sensor_shift import SensorShift
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -43,6 +44,7 @@ class SensorClockDrift(Effect):
     follows_signal = True
     remembers = True
     open_loop_only = True
+    mistaken_for = SensorShift()
     finite_size = "tried_rate"
     form_parameters: tuple[str, ...] = ("tried_rate",)
     lower = -5.0
