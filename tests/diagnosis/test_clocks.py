@@ -17,8 +17,8 @@ def test_a_clock_of_another_rate_is_found_with_its_rate(rate):
     [parameter] = finding.parameters
     assert parameter.unit == "%"
     assert abs(parameter.value - 100.0 * rate) < 3.0 * parameter.standard_error < 0.02
-    words = "0.6 % fast" if rate > 0 else "0.6 % slow"
-    assert f"clock of output `position` runs {words}" in finding.explanation
+    size = f"{abs(parameter.value):.3g} % {'fast' if rate > 0 else 'slow'}"
+    assert finding.explanation == f"The clock of output `position` runs {size} beside the clock of the inputs."
 
 
 @pytest.mark.e2e
