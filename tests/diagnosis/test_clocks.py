@@ -18,7 +18,7 @@ def test_a_clock_of_another_rate_is_found_with_its_rate(rate):
     assert parameter.unit == "%"
     assert abs(parameter.value - 100.0 * rate) < 3.0 * parameter.standard_error < 0.02
     size = f"{abs(parameter.value):.3g} % {'fast' if rate > 0 else 'slow'}"
-    assert finding.explanation == f"The clock of output `position` runs {size} beside the clock of the inputs."
+    assert finding.explanation == f"The clock of output `position` runs {size} relative to the clock of the inputs."
 
 
 @pytest.mark.e2e

@@ -80,5 +80,5 @@ def test_a_clock_of_one_output_leaves_the_other():
     assert not bool(changed[:, 0].any())
     torch.testing.assert_close(changed[:, 1], CommonClockDrift().change(gamma[1:], {}, two)[:, 1])
     text = SensorClockDrift().explained([0.0, 0.8], {}, two)
-    assert text == "The clock of output `speed` runs 0.8 % fast beside the clock of the inputs."
+    assert text == "The clock of output `speed` runs 0.8 % fast relative to the clock of the inputs."
     assert "`force` and `speed` runs 0.8 % slow" in CommonClockDrift().explained([-0.8], {}, two)

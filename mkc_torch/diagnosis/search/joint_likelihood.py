@@ -269,7 +269,7 @@ def _scene(
 def _with_open_loop(
     base: FittedModel, terms: Sequence[Term], tangents: ModelTangents
 ) -> tuple[Float[np.ndarray, "N m K"], Bool[np.ndarray, " K"]]:
-    """Return the tangents of parameters and candidates, and which of them are of the open loop beside an observer."""
+    """Return the tangents of parameters and candidates, and which of them are of the open loop next to an observer."""
     observed = base.model.prepared.observer is not None
     alone = [observed and term.effect.open_loop_only for term in terms]
     chosen = [term for term, is_alone in zip(terms, alone, strict=True) if is_alone]

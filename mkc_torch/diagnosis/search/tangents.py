@@ -76,7 +76,7 @@ class Candidates(Sequence[Tensor]):
         model = model.around(parameters)
         self._signals = model.signals_before(parameters, {term.key for term in self._terms})
         if model.prepared.observer is not None:
-            # along a corrected trajectory these would read the recording ahead
+            # along a corrected trajectory they would read the recording ahead
             free = [number for number, term in enumerate(self._terms) if term.effect.open_loop_only]
             self._held |= {number: self._zeros(self._terms[number]) for number in free}
         for name, known in self._pointwise.items():

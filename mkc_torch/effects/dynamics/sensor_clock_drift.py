@@ -85,7 +85,7 @@ class SensorClockDrift(Effect):
         else:
             each = [f"the clock of outputs {in_a_list(names)} runs {rate_in_words(gamma[0])}"]
         text = in_a_list(each)
-        return f"{text[0].upper()}{text[1:]} beside the clock of the inputs."
+        return f"{text[0].upper()}{text[1:]} relative to the clock of the inputs."
 
     def advised(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
         factors = [f"{1.0 / (1.0 + _PER_CENT * rate):.7g}" for rate in gamma]
