@@ -183,8 +183,8 @@ class BeamSearch:
             return found
         shapes = candidate_terms(fit.model.prepared, (), (rival,))
         other = self._fitted_with(fit, additions(fit, shapes, self.settings.noise)[0])
-        scores = [score(model, self.basis, self.settings) for model in (found, other)]
-        return found if separation(*scores, self.basis) > self.settings.naming.separable else None
+        own, others_score = (score(model, self.basis, self.settings) for model in (found, other))
+        return found if separation(own, others_score, self.basis) > self.settings.naming.separable else None
 
     def _expand(self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term], most: int) -> None:
         """Fit and score the models that one move leads to, up to a number of models in all."""
