@@ -13,6 +13,7 @@ what differs. The tests run one common suite over every effect of the catalogue,
 from __future__ import annotations
 
 from mkc_torch.effects.base import Effect, GainEffect, in_words
+from mkc_torch.effects.clock import resampled
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.dynamics import DYNAMICS
 from mkc_torch.effects.dynamics.input_transport_delay import travelled
@@ -49,6 +50,7 @@ __all__ = [
     "kind_of",
     "lagged",
     "played",
+    "resampled",
     "shifted",
     "soft_clip",
     "travelled",

@@ -78,6 +78,10 @@ class Effect(ABC):
             several are in series on an input or an output. Default False.
         settles: parameters of the clocks, "offset" or "rate", that it is equivalent to where it acts on all outputs;
             they are held at 0 while it is fitted. Default none.
+        mistaken_for: an effect outside the catalogue that a recording has to exclude before this one is named; default
+            None.
+        open_loop_only: whether it is computed and fitted along the open loop only, because along a trajectory that an
+            observer corrects it would read the recording ahead; default False.
 
     Amplitude and shape:
 
@@ -93,6 +97,8 @@ class Effect(ABC):
             logarithm.
         natural_ends: name of a fitted shape parameter to the ends of its range, "least" or "greatest", that are
             ordinary values; an estimate at any other end is doubtful. Default none.
+        finite_size: name of the shape parameter with the size γ at which its change is computed for the screening, of
+            an effect that is far from linear in γ; default none: the derivative at γ = 0.
         form_parameters: names of shape parameters that choose a form and are not measured; the equation states them.
         shape_units: name of a shape parameter to its unit, for those whose unit does not depend on the recording;
             default s for onset, lag, delay and time_constant.
@@ -145,6 +151,8 @@ class Effect(ABC):
     unrecorded: bool = False
     remembers: bool = False
     settles: tuple[str, ...] = ()
+    mistaken_for: Effect | None = None
+    open_loop_only: bool = False
 
     lower: float = -math.inf
     upper: float = math.inf
@@ -152,6 +160,7 @@ class Effect(ABC):
     continuous: Mapping[str, tuple[float, float]] = {}
     fitted_shape: Mapping[str, tuple[float, float]] = {}
     natural_ends: Mapping[str, tuple[str, ...]] = {}
+    finite_size: str = ""
     form_parameters: tuple[str, ...] = ()
     shape_units: Mapping[str, str] = dict.fromkeys(("onset", "lag", "delay", "time_constant"), "s")
     plot_axis: str = ""

@@ -1,4 +1,4 @@
-"""Recordings of a driven mass on a spring whose input is late."""
+"""Recordings of a driven mass on a spring whose sensor has a clock of another rate, or whose input is late."""
 
 import numpy as np
 import torch
@@ -27,13 +27,14 @@ class Stage(Dynamics):
         return {"position": x.velocity, "velocity": force / p.mass}
 
 
-def stage_recording(seed, N=800, *, late=0, noise=0.004):
+def stage_recording(seed, N=800, *, rate=0.0, late=0, noise=0.004):
     """Return a recording of a stage.
 
     Args:
         seed: of the force and the noise.
         N: number of samples.
-        late: samples by which the force acts later than its column shows.
+        rate: share by which the clock of the sensor runs fast.
+        late: samples by which the force acts later than its column shows; negative for earlier.
         noise: standard deviation in m.
     """
     random = np.random.default_rng(seed)
@@ -44,7 +45,8 @@ def stage_recording(seed, N=800, *, late=0, noise=0.004):
         return [x[1], (np.interp(t, time, force) - 6.6 * x[0] - 0.7 * x[1]) / 1.1]
 
     solved = solve_ivp(rates, (0.0, time[-1]), [0.1, 0.0], dense_output=True, rtol=1e-8, atol=1e-9, max_step=STEP)
-    position = solved.sol(time[50 : 50 + N])[0] + noise * random.standard_normal(N)
+    at = time[50] + STEP * np.arange(N) / (1.0 + rate)
+    position = solved.sol(at)[0] + noise * random.standard_normal(N)
     shown = force[50 + late : 50 + late + N]
     columns = {"time": STEP * np.arange(N), "force": shown, "position": position}
     return Recording({name: torch.as_tensor(values) for name, values in columns.items()})

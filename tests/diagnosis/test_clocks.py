@@ -1,4 +1,4 @@
-"""An input that acts a row late, on a driven mass."""
+"""A sensor's clock of another rate, and an input that acts a row late, on a driven mass."""
 
 import pytest
 
@@ -6,6 +6,27 @@ from mkc_torch import diagnose
 from mkc_torch.diagnosis.findings.one_row import rows_late
 from mkc_torch.diagnosis.parts import EffectParameter
 from tests.diagnosis.clocks import STEP, Stage, stage_recording
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("rate", [0.006, -0.006])
+def test_a_clock_of_another_rate_is_found_with_its_rate(rate):
+    found = diagnose(Stage(), stage_recording(1, rate=rate), surrogates=19, max_findings=1)
+    [finding] = found.findings
+    assert finding.effect == "sensor_clock_drift"
+    [parameter] = finding.parameters
+    assert parameter.unit == "%"
+    assert abs(parameter.value - 100.0 * rate) < 3.0 * parameter.standard_error < 0.02
+    size = f"{abs(parameter.value):.3g} % {'fast' if rate > 0 else 'slow'}"
+    assert finding.explanation == f"The clock of output `position` runs {size} relative to the clock of the inputs."
+
+
+@pytest.mark.e2e
+def test_a_constant_offset_of_the_clocks_is_no_drift():
+    """The force acts three samples before its column shows it, which no effect of the catalogue names."""
+    found = diagnose(Stage(), stage_recording(1, late=-3), surrogates=19, max_findings=1)
+    assert found.p_value <= 0.05
+    assert "sensor_clock_drift" not in {finding.effect for finding in found.findings}
 
 
 @pytest.mark.e2e

@@ -22,6 +22,7 @@ from mkc_torch.effects.dynamics.hidden_mode import HiddenMode
 from mkc_torch.effects.dynamics.input_delay import InputDelay
 from mkc_torch.effects.dynamics.power_law import PowerLaw
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
+from mkc_torch.effects.dynamics.sensor_clock_drift import SensorClockDrift
 from mkc_torch.effects.dynamics.sensor_lag import SensorLag
 from mkc_torch.simulation import Dynamics, Parameter
 
@@ -88,6 +89,7 @@ def test_a_spring_of_the_wrong_sign_is_not_explained_by_a_power_law(assessed, ra
         (QuadraticDrag(), False),
         (HiddenMode(), False),
         (HiddenLag(), False),
+        (SensorClockDrift(), False),
     ],
 )
 def test_general_forms_and_delays_are_flexible_and_a_passive_second_mass_is_not(effect, flexible):

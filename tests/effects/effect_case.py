@@ -10,14 +10,14 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.effects import Effect, beyond, curve_within, lagged, played, shifted, soft_clip, travelled
+from mkc_torch.effects import Effect, beyond, curve_within, lagged, played, resampled, shifted, soft_clip, travelled
 from mkc_torch.effects.kinds import absolute_zero
 from mkc_torch.effects.waveforms import outer_product
 from mkc_torch.simulation.dynamics.ports import memory_at
 from mkc_torch.simulation.ports import SignalSizes
 from tests.effects.contexts import contexts_of, kinds_of_shapes, size_of
 
-NONLINEAR = ("delay", "clock_drift", "backlash", "driver_parameter_arrhenius")
+NONLINEAR = ("delay", "clock_drift", "sensor_clock_drift", "backlash", "driver_parameter_arrhenius")
 """Effects on an output or a parameter that are not linear in γ: a time, a gap, or an exponent."""
 
 
@@ -272,7 +272,7 @@ class OfEveryShape:
         x = SimpleNamespace(**dict(zip((*carried, *inner), context.signal.unbind(-1), strict=True)))
         names = {part: f"x.{name}" for part, name in context.parts.items()} | {name: f"x.{name}" for name in inner}
         names["zero"] = "273.15" if context.unit_of("own") == "°C" else "0.0"
-        if not effect.needs and effect.port == "output":  # it acts on all outputs
+        if set(effect.needs) <= {"driven"} and effect.port == "output":  # it acts on all outputs
             names = {name: f"x.{name}" for name in carried}
         if context.units:
             means = context.driver_means or (0.0,)
@@ -283,7 +283,7 @@ class OfEveryShape:
         known = {"x": x, "torch": torch, "time": context.time, "run": context.runs}
         known |= {"d": context.recorded} if context.units else {}
         known |= {"lagged": lagged, "shifted": shifted, "played": played, "soft_clip": soft_clip, "beyond": beyond}
-        known |= {"curve_within": curve_within, "travelled": travelled}
+        known |= {"curve_within": curve_within, "travelled": travelled, "resampled": resampled}
         shape = {name: float(value) for name, value in shape.items()}
         lines = effect.code(gamma.tolist(), shape, names)
         written = torch.stack([eval(line, known) + torch.zeros_like(context.time) for line in lines], -1)

@@ -129,7 +129,7 @@ def test_optional_abilities_of_effects():
         FieldGradient, MagneticPole, DriverOutputQuadratic, DriverParameterQuadratic,
     }  # fmt: skip
     assert {e.id for e in CATALOGUE if e.has_code} == {e.id for e in DYNAMICS} | {"output_saturation"}
-    assert {e.id for e in CATALOGUE if e.simpler} == {"coupling", "sensor_lag", "delay"}
+    assert {e.id for e in CATALOGUE if e.simpler} == {"coupling", "sensor_lag", "sensor_clock_drift", "delay"}
     coulomb = dict.fromkeys(("stribeck_friction", "load_dependent_friction"), "coulomb_friction")
     linear = dict.fromkeys(("driver_parameter_quadratic", "driver_parameter_arrhenius"), "driver_parameter")
     linear |= {"driver_output_quadratic": "driver_output", "input_transport_delay": "input_delay"}

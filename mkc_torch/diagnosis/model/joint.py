@@ -189,6 +189,11 @@ class JointModel:
         """Leave out the compiled residual; another process compiles it again."""
         return {name: value for name, value in vars(self).items() if name != "_compiled"}
 
+    @property
+    def open_loop_only(self) -> bool:
+        """Whether an effect cannot be computed along a trajectory that an observer corrects."""
+        return any(term.effect.open_loop_only for term in self.terms)
+
     def with_term(self, term: Term) -> JointModel:
         return JointModel(self.prepared, (*self.terms, term), self.near)
 
@@ -264,7 +269,10 @@ def _widened(added: Float[Tensor, "N c"], width: int) -> Float[Tensor, "N w"]:
 
 
 def directions(term: Term, context: Context) -> Float[Tensor, "N c q"]:
-    """Return the derivative of an effect's change at its port by γ at γ = 0, by forward mode if it is not given."""
+    """Return the derivative of an effect's change at its port by γ at γ = 0, by forward mode if it is not given.
+
+    Of an effect with a ``finite_size`` the change at that size of each number of γ, over the size.
+    """
     if term.effect.has_basis:
         return term.effect.basis(term.shape, context)
     if term.effect.has_waveform:
@@ -275,6 +283,10 @@ def directions(term: Term, context: Context) -> Float[Tensor, "N c q"]:
     def change(gamma: Tensor) -> Tensor:
         return term.effect.change(gamma, term.shape, context)
 
+    if term.effect.finite_size:
+        size = term.shape[term.effect.finite_size]
+        sizes = size * torch.eye(term.size(context), dtype=context.signal.dtype)
+        return torch.stack([change(gamma) / size for gamma in sizes], -1)
     return forward_jacobian(change, context.signal.new_zeros(term.size(context)), context.signal.numel())
 
 

@@ -201,6 +201,8 @@ def fit_with_process_noise(
         model: the model, if there is no open-loop fit.
     """
     starts = 1 + len(more_starts)
+    if free is not None and free.model.open_loop_only:
+        return ProcessNoiseFit(free, free, None, starts)
     noise = None if free is None else estimate_noise(free, declared, settings)
     if free is not None and (noise is None or noise.observer is None):
         return ProcessNoiseFit(free, free, noise, starts)
@@ -251,7 +253,7 @@ def with_noise_around(fit: FittedModel, declared: Mapping[str, float], settings:
 
     Parameters that are fitted together with process noise can leave the open loop that they were chosen for.
     """
-    noise = estimate_noise(fit, declared, settings)
+    noise = None if fit.model.open_loop_only else estimate_noise(fit, declared, settings)
     if noise is None or noise.observer is None:
         return fit
     model = JointModel(fit.model.prepared.observed(noise.observer), fit.model.terms, fit.model.near)

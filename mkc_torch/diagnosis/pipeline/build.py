@@ -230,10 +230,12 @@ def is_flexible(term: Term) -> bool:
 
     A second mass or store, which is a general form too, is passive: it has an own state and a share of its own, and
     depends on no component or column by itself. It cannot reverse a sign, and a simulation without it can explain
-    little, as that of a motor with a load on a flexible shaft does.
+    little, as that of a motor with a load on a flexible shaft does. Nor can a clock, which is right at the start of
+    each run, while the free run loses a long recording.
     """
     effect = term.effect
-    return effect.is_curve or effect.remembers or (effect.is_generalisation and bool(effect.plot_axis or term.columns))
+    late = effect.remembers and not effect.open_loop_only
+    return effect.is_curve or late or (effect.is_generalisation and bool(effect.plot_axis or term.columns))
 
 
 def _structure(

@@ -11,10 +11,10 @@ import torch
 
 from mkc_torch.diagnosis.model.fit import SEARCH, FittedModel, fitted, fitted_with_effect
 from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise, has_process_noise
-from mkc_torch.diagnosis.model.shapes import shape_fitted, with_profiled_shape
+from mkc_torch.diagnosis.model.shapes import candidate_terms, shape_fitted, with_profiled_shape
 from mkc_torch.diagnosis.model.suspect import suspect_id
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
-from mkc_torch.diagnosis.score import ScoreBasis, is_implausible, score
+from mkc_torch.diagnosis.score import ScoreBasis, is_implausible, score, separation
 from mkc_torch.diagnosis.search.candidate import Candidate, ModelKey, in_order, model_key
 from mkc_torch.diagnosis.search.move_fits import (
     POLISHED,
@@ -174,6 +174,18 @@ class BeamSearch:
     ) -> FittedModel:
         return fitted_with(fit, addition, others, implausible=partial(is_implausible, basis=self.basis))
 
+    def _distinct(
+        self, fit: FittedModel, addition: Addition, others: Sequence[Callable[[], FittedModel | None]] = ()
+    ) -> FittedModel | None:
+        """Return the fit with one more effect; None if what it is mistaken for cannot be separated from it."""
+        found, rival = self._fitted_with(fit, addition, others), addition.starts[0][0].effect.mistaken_for
+        if rival is None:
+            return found
+        shapes = candidate_terms(fit.model.prepared, (), (rival,))
+        other = self._fitted_with(fit, additions(fit, shapes, self.settings.noise)[0])
+        own, others_score = (score(model, self.basis, self.settings) for model in (found, other))
+        return found if separation(own, others_score, self.basis) > self.settings.naming.separable else None
+
     def _expand(self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term], most: int) -> None:
         """Fit and score the models that one move leads to, up to a number of models in all."""
         fit, have = model.fit, len(model.fit.model.terms)
@@ -182,7 +194,7 @@ class BeamSearch:
             others = self._other_starts(fit, terms, further) if not have else {}
             for addition in self._chosen(additions(fit, terms, self.settings.noise), model, rank, further):
                 key = model_key([*fit.model.terms, addition.starts[0][0]])
-                work = partial(self._fitted_with, fit, addition, others.get(addition.key, ()))
+                work = partial(self._distinct, fit, addition, others.get(addition.key, ()))
                 works.append((key, f"add {self._id(addition.starts[0][0])}", work))
         for number, term in enumerate(fit.model.terms):
             if have > 1:
@@ -239,7 +251,7 @@ class BeamSearch:
                 other = addition.starts[0][0]
                 key = model_key([*rest.fit.model.terms, other])
                 move = f"exchange {self._id(term)} for {self._id(other)}"
-                works.append((key, move, partial(self._fitted_with, rest.fit, addition)))
+                works.append((key, move, partial(self._distinct, rest.fit, addition)))
         self._fit(works, fit, self.most_models)
 
     def _other_starts(
@@ -264,7 +276,7 @@ class BeamSearch:
             found.setdefault(key, []).append(held)
         if noisy is not None:
             leading = {term.key for term in further}
-            led = [term for term in terms if term.key in leading]
+            led = [term for term in terms if term.key in leading and not term.effect.open_loop_only]
             for addition in additions(noisy, led, self.settings.noise):
                 found.setdefault(addition.key, []).append(partial(fitted_through_noise, noisy, *addition.starts[0]))
         return found

@@ -21,7 +21,7 @@ from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.likelihoods import PRICE, Columns, Limits, LogLikelihoods, log_likelihoods
 from mkc_torch.diagnosis.search.significance import COUNTS, COUNTS_NOT, best_rank_p_value
 from mkc_torch.diagnosis.search.significance import price as price_of_candidate
-from mkc_torch.diagnosis.search.tangents import ModelTangents
+from mkc_torch.diagnosis.search.tangents import ModelTangents, open_loop_tangents
 from mkc_torch.diagnosis.thresholds import NULL_WITHIN
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
 from mkc_torch.simulation.dynamics.kalman import Flow
@@ -33,7 +33,7 @@ from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.dynamics.whitening import SeriesAlong, gains_of, joined, relative_to, whitened
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 _STEPS = (0.5, 0.5, 0.25, 0.25, 0.125)
 """Decades by which sizes and times of the leading noise models are varied, round by round."""
@@ -252,10 +252,10 @@ def _scene(
     ):
         return None
     counted = replace(flow, counts=flow.counts * counts.double().cpu().numpy())
-    moved = torch.cat([tangents.nuisance, *tangents.candidates], -1).double().cpu().numpy()
+    moved, free = _with_open_loop(base, terms, tangents)
     series = SeriesAlong(flow.new[..., None], flow.shift[..., None])
     columns = Columns(
-        _along(flow, prepared, base.residual, moved),
+        _along(flow, prepared, base.residual, moved, free),
         model.size,
         tuple(columns.shape[-1] for columns in tangents.candidates),
         tuple(term.effect.one_sided for term in terms),
@@ -266,6 +266,20 @@ def _scene(
     return _LinearisedRecording(prepared, flow, counted, series, columns, largest, price)
 
 
+def _with_open_loop(
+    base: FittedModel, terms: Sequence[Term], tangents: ModelTangents
+) -> tuple[Float[np.ndarray, "N m K"], Bool[np.ndarray, " K"]]:
+    """Return the tangents of parameters and candidates, and which of them are of the open loop next to an observer."""
+    observed = base.model.prepared.observer is not None
+    alone = [observed and term.effect.open_loop_only for term in terms]
+    chosen = [term for term, is_alone in zip(terms, alone, strict=True) if is_alone]
+    found = iter(open_loop_tangents(base.model, base.parameters, chosen))
+    columns = [next(found) if is_alone else own for own, is_alone in zip(tangents.candidates, alone, strict=True)]
+    moved = torch.cat([tangents.nuisance, *columns], -1).double().cpu().numpy()
+    free = [is_alone for own, is_alone in zip(columns, alone, strict=True) for _ in range(own.shape[-1])]
+    return moved, np.array([False] * tangents.nuisance.shape[-1] + free)
+
+
 def _limits(base: FittedModel) -> Limits | None:
     """Return the priors of the simulation's own parameters; None without."""
     prior = base.model.prior
@@ -274,16 +288,23 @@ def _limits(base: FittedModel) -> Limits | None:
     return Limits.of(*(values.double().cpu().numpy() for values in (base.parameters, prior.mean, prior.precision)))
 
 
-def _along(flow: Flow, prepared: PreparedDynamics, residual: Tensor, moved: Float[np.ndarray, "N m K"]) -> SeriesAlong:
-    """Return tangents of a residual as series along its trajectory."""
+def _along(
+    flow: Flow,
+    prepared: PreparedDynamics,
+    residual: Tensor,
+    moved: Float[np.ndarray, "N m K"],
+    free: Bool[np.ndarray, " K"],
+) -> SeriesAlong:
+    """Return tangents of a residual as series along its trajectory; those that are ``free`` are of the open loop."""
     observer = prepared.observer
+    plain = SeriesAlong(moved, np.zeros((len(moved) - 1, flow.transition.shape[1], moved.shape[-1])))
     if observer is None:
-        return SeriesAlong(moved, np.zeros((len(moved) - 1, flow.transition.shape[1], moved.shape[-1])))
+        return plain
     back = torch.linalg.inv(observer.white)
     slope = clipped_slope(torch.einsum("nij,nj->ni", back, residual), observer.spread)
     names, channels = prepared.disturbable, prepared.channels
     model = NoiseModel.of(observer.lasting, observer.sensor.tolist(), names, channels)
-    return relative_to(
+    found = relative_to(
         flow,
         observer.gain.double().cpu().numpy(),
         np.array([place for place, _, _ in model.components], dtype=int),
@@ -291,6 +312,7 @@ def _along(flow: Flow, prepared: PreparedDynamics, residual: Tensor, moved: Floa
         back.double().cpu().numpy() @ moved,
         slope.double().cpu().numpy(),
     )
+    return SeriesAlong(np.where(free, plain.new, found.new), np.where(free, plain.shift, found.shift))
 
 
 def _refined(

@@ -86,7 +86,7 @@ def at_own_holds(fit: FittedModel, fixed: Mapping[str, str]) -> FittedModel | No
 def fits_at_own_holds(
     fit: FittedModel, terms: Sequence[Term], fixed: Mapping[str, str], settings: NoiseSettings
 ) -> Iterator[tuple[Key, Callable[[], FittedModel]]]:
-    """Yield fits of each delay and lag from the simulation's own holds of its inputs, if the fit has others.
+    """Yield fits of each delay, lag and clock from the simulation's own holds of its inputs, if the fit has others.
 
     A hold imitates a delay of half a sample, so the most likely hold of the simulation alone can hide a part of it.
 

@@ -95,7 +95,8 @@ def _ranked(found: JointLikelihood, terms: tuple[Term, ...], prefer: ModelPrior)
 def _fit_of(base: FittedModel, term: Term, found: JointLikelihood, number: int) -> FittedModel:
     """Return the joint fit of a candidate, under its remaining process noise by the screening."""
     begin = found.start(number)
-    smaller = base.model.prepared.observed(begin.observer)
+    free = term.effect.open_loop_only or base.model.open_loop_only
+    smaller = base.model.prepared.observed(None if free else begin.observer)
     start = torch.cat([_inside(base, base.parameters + begin.shift), begin.gamma])
     model = JointModel(smaller, (*base.model.terms, term), base.model.near)
     size_zero = torch.cat([base.parameters, torch.zeros_like(begin.gamma)])

@@ -75,8 +75,12 @@ class Candidates(Sequence[Tensor]):
             return
         model = model.around(parameters)
         self._signals = model.signals_before(parameters, {term.key for term in self._terms})
+        if model.prepared.observer is not None:
+            # along a corrected trajectory they would read the recording ahead
+            free = [number for number, term in enumerate(self._terms) if term.effect.open_loop_only]
+            self._held |= {number: self._zeros(self._terms[number]) for number in free}
         for name, known in self._pointwise.items():
-            members = [number for number, term in enumerate(self._terms) if term.port == name]
+            members = [k for k, term in enumerate(self._terms) if term.port == name and k not in self._held]
             if known is None and members:
                 self._held |= self._along_trajectories(model, parameters, name, members)
         cells = 0
@@ -123,11 +127,30 @@ class Candidates(Sequence[Tensor]):
         parts = moved.split([course.shape[-1] for course in courses], -1)
         return {number: self._usable(term, part) for number, term, part in zip(members, terms, parts, strict=True)}
 
+    def _zeros(self, term: Term) -> Tensor:
+        context = term.context(self._prepared, self._signals.get(term.port))
+        return context.time.new_zeros(len(self._prepared.time), len(self._independent), term.size(context))
+
     def _usable(self, term: Term, moved: Tensor) -> Tensor:
         if term.effect.follows_signal and not all(self._prepared.independent):
             moved = self._independent[:, None] * moved
         # a candidate without a finite slope here cannot be named
         return moved if bool(moved.isfinite().all()) else torch.zeros_like(moved)
+
+
+def open_loop_tangents(
+    model: JointModel, parameters: Float[Tensor, " p"], terms: Sequence[Term]
+) -> tuple[Float[Tensor, "N m q"], ...]:
+    """Return the tangents of candidates along the open loop of a model, in units of the outputs.
+
+    Args:
+        model: in open loop, or with an observer, which is left out.
+        parameters: of the model.
+        terms: the candidates.
+    """
+    prepared = model.prepared.open_loop()
+    free = JointModel(prepared, model.terms)
+    return tuple(Candidates(free, parameters, terms, dict.fromkeys(prepared.ports)))
 
 
 class _Chained(Sequence[Tensor]):

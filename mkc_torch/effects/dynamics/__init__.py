@@ -38,6 +38,7 @@ from mkc_torch.effects.dynamics.overflow_into import OverflowInto
 from mkc_torch.effects.dynamics.position_periodic_force import PositionPeriodicForce
 from mkc_torch.effects.dynamics.power_law import PowerLaw
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
+from mkc_torch.effects.dynamics.sensor_clock_drift import SensorClockDrift
 from mkc_torch.effects.dynamics.sensor_lag import SensorLag
 from mkc_torch.effects.dynamics.stribeck_friction import StribeckFriction
 from mkc_torch.effects.dynamics.thermal_loss import ThermalLoss
@@ -91,6 +92,7 @@ DYNAMICS: tuple[Effect, ...] = (
     DriverOutputQuadratic(),
     DriverOutputLagged(),
     SensorLag(),
+    SensorClockDrift(),
     UnknownRate("difference"),
     UnknownRate("own"),
     UnknownRate("position"),

@@ -134,6 +134,8 @@ class PortContext:
                 run=self.run,
             )
         parts = {"own": self.channels[0], **{f"output {name}": name for name in self.channels[1:]}}
+        if self.system.inputs and self.system.restart_after is None:
+            parts["driven"] = self.channels[0]
         units = {part: self._unit_of(name) for part, name in parts.items()}
         unit = common_unit(self._unit_of(name) for name in self.channels)
         output = Port(self.channels, unit, pointwise=False, parts=parts, part_units=units, run=self.run)

@@ -61,6 +61,7 @@ NEVER_HIDDEN = {
     "buoyancy": "no plant has a height of either sign",
     "gain": "the joint's scale is fitted",
     "clock_drift": "no plant has a clock of its own",
+    "sensor_clock_drift": "as for clocks of paired data; `tests.diagnosis.test_clocks` hides it",
     "driver_linear": "no plant has a driver that is recorded and is no input",
     "driver_quadratic": "as for the linear one",
     "driver_gain": "as for the linear one",

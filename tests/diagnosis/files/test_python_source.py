@@ -80,6 +80,7 @@ PLACES = {
     "input_delay": ("input force", {"delay": 0.23}),
     "input_lag": ("input force", {"lag": 0.2}),
     "sensor_lag": ("output", {"lag": 0.17}),
+    "sensor_clock_drift": ("output", {"tried_rate": 0.5}),
 }
 
 

@@ -145,7 +145,7 @@ def test_a_model_with_a_simpler_form_is_restored_from_json():
 
 def test_every_simpler_form_has_fewer_parameters():
     nested = [effect for effect in DYNAMICS if effect.simpler is not None]
-    assert {effect.id for effect in nested} == {"coupling", "sensor_lag"}
+    assert {effect.id for effect in nested} == {"coupling", "sensor_lag", "sensor_clock_drift"}
     prepared = Bodies().prepare(bodies_recording())
     for effect in nested:
         (term, *_) = candidate_terms(prepared, (), (effect,))

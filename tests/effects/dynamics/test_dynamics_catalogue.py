@@ -53,7 +53,7 @@ def test_losses_dissipate_energy(name):
 def test_signs_of_amplitudes():
     assert {e.id for e in DYNAMICS if e.lower == -math.inf} >= set(EITHER_SIGN)
     assert {e.id: e.upper for e in DYNAMICS if 1.0 < e.upper < math.inf} == {
-        "hidden_lag": 100.0, "hidden_mode": 10.0, "driver_parameter_arrhenius": 2.0,
+        "hidden_lag": 100.0, "hidden_mode": 10.0, "driver_parameter_arrhenius": 2.0, "sensor_clock_drift": 5.0,
     }  # fmt: skip
     assert {e.id for e in DYNAMICS if (e.lower, e.upper) == (0.0, 1.0)} >= set(SHARES)
     for effect in DYNAMICS:
@@ -258,6 +258,16 @@ def test_a_sensor_lags_by_its_time_constant():
     torch.testing.assert_close(shown, 3.0 * (time - 0.8 * (1.0 - torch.exp(-time / 0.8))))
 
 
+def test_a_fast_clock_stretches_the_output_from_the_start_of_each_run():
+    effect = EFFECT_BY_ID["sensor_clock_drift"]
+    time = torch.cat([torch.linspace(3.0, 8.0, 101), torch.linspace(1.0, 5.0, 81)]).double()
+    since = time - torch.where(torch.arange(182) < 101, 3.0, 1.0).double()
+    course = (4.0 - 2.0 * since).unsqueeze(-1)
+    context = replace(dynamic_context(effect), time=time, signal=course)
+    shown = (course + change(effect, [2.0], {}, context))[:, 0]
+    torch.testing.assert_close(shown, 4.0 - 2.0 * since / 1.02)
+
+
 @pytest.mark.parametrize(
     ("name", "units"),
     [
@@ -267,6 +277,7 @@ def test_a_sensor_lags_by_its_time_constant():
         ("coupling", ["1/s"]),
         ("thermal_loss", ["1/s"]),
         ("sensor_lag", [""]),
+        ("sensor_clock_drift", ["%"]),
     ],
 )
 def test_amplitudes_have_the_units_of_their_formulas(name, units):
@@ -446,7 +457,7 @@ class TestNeeds:
         known = {
             "own", "position", "angle", "deflection", "reversing", "load", "temperature", "level", "other level",
             "other", "rate", "height", "sideways", "flowing", "surroundings",
-            "actuator",
+            "actuator", "driven",
         }  # fmt: skip
         for effect in DYNAMICS:
             assert set(effect.needs) <= known
