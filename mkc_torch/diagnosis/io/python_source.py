@@ -187,6 +187,8 @@ def _states(system: Dynamics, memories: Mapping[str, str], theta: Sequence[float
         guesses |= {name: sum(begun) / len(begun)} if begun else {}
     text = ", ".join(json.dumps(name) for name in memories)
     lines = [f"    states = (*{base}.states, {text})"] if memories else []
+    tied = ", ".join(f"{json.dumps(name)}: {json.dumps(like)}" for name, like in memories.items())
+    lines += [f"    starts_as = {{**{base}.starts_as, {tied}}}"] if memories else []
     guessed = ", ".join(f"{json.dumps(name)}: {_rounded(value)!r}" for name, value in guesses.items())
     return [*lines, f"    initial = {{**{base}.initial, {guessed}}}"] if guessed else lines
 

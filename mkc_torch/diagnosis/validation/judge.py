@@ -1,0 +1,84 @@
+"""Decide whether a model holds in an output."""
+
+from __future__ import annotations
+
+import math
+
+from mkc_torch._support.typesetting import plain
+from mkc_torch.diagnosis.io.training import OutputTraining
+from mkc_torch.diagnosis.thresholds import LARGER, SMALL
+from mkc_torch.diagnosis.validation.blocks import Ratio, independent_ratio, paired_ratio
+from mkc_torch.diagnosis.validation.result import OutputCheck
+
+
+def claims(training: OutputTraining | None) -> bool:
+    """Whether the findings make the residual of an output clearly smaller in the diagnosed recording: by 5 % or more,
+    with the interval of the ratio below 1.
+
+    Example:
+        >>> from mkc_torch.diagnosis.io.training import BlockSquares
+        >>> before = BlockSquares((4.0, 4.4, 3.6), (9, 9, 9))
+        >>> claims(OutputTraining(before, BlockSquares((1.0, 1.2, 0.8), (9, 9, 9)))), claims(None)
+        (True, False)
+    """
+    if training is None:
+        return False
+    ratio = paired_ratio(training.corrected, training.baseline)
+    return ratio.value <= 1.0 - SMALL and ratio.high < 1.0
+
+
+def clearly_larger(ratio: Ratio) -> bool:
+    """Whether a residual is clearly larger: by more than 5 %, with the interval of the ratio above 1.
+
+    Example:
+        >>> clearly_larger(Ratio(1.2, 1.1, 1.3)), clearly_larger(Ratio(1.2, 0.9, 1.6))
+        (True, False)
+    """
+    return ratio.value > LARGER and ratio.low > 1.0
+
+
+def judged(
+    output: str, unit: str, new: OutputTraining, training: OutputTraining | None, *, findings: bool, any_claim: bool
+) -> OutputCheck:
+    """Return the check of an output.
+
+    A claimed output fails unless the interval of corrected over baseline is below 1; another output fails if its
+    residual is clearly larger with the findings. A model that claims nothing in any output fails in an output whose
+    residual is clearly larger than in the diagnosed recording.
+
+    Args:
+        output, unit: name and unit.
+        new: residuals in the new recording.
+        training: residuals in the diagnosed recording; None if they are unknown.
+        findings: whether the model has any; without them both simulations are the same.
+        any_claim: whether the findings claim an improvement in any output.
+    """
+    ratio, claimed = paired_ratio(new.corrected, new.baseline), claims(training)
+    missing = Ratio(math.nan, math.nan, math.nan)
+    growth = missing if training is None else independent_ratio(new.corrected, training.corrected)
+    name = plain(output)
+    failure = ""
+    if not math.isfinite(new.corrected.rmse):
+        failure = f"{name}: it has no predicted samples."
+    elif claimed and not ratio.high < 1.0:
+        failure = f"{name}: the findings do not make the residual clearly smaller: {_with_interval(ratio)} times."
+    elif findings and clearly_larger(ratio):
+        failure = f"{name}: the findings make the residual clearly larger: {_with_interval(ratio)} times."
+    elif not any_claim and clearly_larger(growth):
+        failure = (
+            f"{name}: the residual is clearly larger than in the diagnosed recording: {_with_interval(growth)} times."
+        )
+    before = math.nan if training is None else training.corrected.rmse
+    return OutputCheck(output, unit, new.baseline.rmse, new.corrected.rmse, before, ratio, growth, claimed, failure)
+
+
+def _with_interval(ratio: Ratio) -> str:
+    """Return a ratio with its interval.
+
+    Example:
+        >>> _with_interval(Ratio(0.5, 0.41, 0.62))
+        '0.50 (95 % interval 0.41 to 0.62)'
+    """
+    if math.isnan(ratio.low):
+        return f"{ratio.value:.2f} (too few samples for an interval)"
+    return f"{ratio.value:.2f} (95 % interval {ratio.low:.2f} to {ratio.high:.2f})"
