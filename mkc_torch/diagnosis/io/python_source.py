@@ -114,7 +114,16 @@ def python_source(
     imports = "\n\n".join("\n".join(group) for group in groups if group)
     return (
         f'"""{kind.__name__}, with the findings of `mkc diagnose`; all numbers were fitted to its recording."""\n\n'
-        f"{imports}\n\n\n{text}\n"
+        f"{imports}\n\n\n{text}\n\n\n{_alone(kind)}"
+    )
+
+
+def _alone(kind: type) -> str:
+    """Return the lines for `python corrected.py NEW.csv`."""
+    return (
+        'if __name__ == "__main__":\n'
+        "    from mkc_torch.diagnosis.validation.alone import run_alone\n\n"
+        f"    run_alone(Corrected{kind.__name__})\n"
     )
 
 

@@ -8,7 +8,7 @@ from mkc_torch._support.arguments import format_value
 from mkc_torch.diagnosis.io.model import DiagnosedModel
 from mkc_torch.diagnosis.result import CorrectingModel
 from mkc_torch.diagnosis.validation.fingerprint import of_runs
-from mkc_torch.diagnosis.validation.judge import claims, clearly_larger, judged
+from mkc_torch.diagnosis.validation.judge import claims, clearly_grown, judged, unless_lost
 from mkc_torch.diagnosis.validation.result import CheckTraces, OutputCheck, RecordingCheck
 from mkc_torch.diagnosis.validation.training import compared, predict_both
 from mkc_torch.recording.recording import Recording
@@ -30,9 +30,10 @@ def check(
     initial states are estimated from the first part of each trajectory, and the rest is predicted in open loop; a model
     with ``restart_after`` is predicted in the segments that it was fitted with. The model holds if in every output that
     the findings improve in the diagnosed recording, by 5 % or more, the 95 % interval of the ratio of the root mean
-    squares, with over without findings, is below 1, and no other output gets clearly worse. A model without such an
-    output holds if no residual is clearly larger than in the diagnosed recording. A magnetometer's model is checked by the spread of the corrected
-    field's length about its median.
+    squares, with over without findings, is below 1, and no other output gets clearly worse, and the simulation
+    follows the recording at all. A model without such an
+    output holds if no residual is clearly larger than in the diagnosed recording. A magnetometer's model is checked by
+    the spread of the corrected field's length about its median.
 
     Args:
         model: such as ``Diagnosis.model``, or :meth:`mkc_torch.diagnosis.DiagnosedModel.from_json` with its simulation.
@@ -84,8 +85,8 @@ def check(
     new = compared(baseline, corrected)
     any_claim = any(claims(each) for name, each in known.outputs.items() if name in new)
     outputs = tuple(
-        judged(name, unit, new[name], known.outputs.get(name), findings=bool(model.terms), any_claim=any_claim)
-        for name, unit in zip(corrected.outputs, corrected.units, strict=True)
+        judged(name, unit, new[name], known.outputs.get(name), share, findings=bool(model.terms), any_claim=any_claim)
+        for name, unit, share in zip(corrected.outputs, corrected.units, corrected.explained, strict=True)
     )
     accuracy = max(baseline.accuracy, corrected.accuracy)
     return RecordingCheck(
@@ -96,7 +97,7 @@ def check(
         start_seconds=corrected.start_seconds,
         segment_seconds=model.state.get("restart_after"),
         findings=tuple(term.effect.id for term in model.terms),
-        outputs=outputs,
+        outputs=unless_lost(outputs),
         used_in_fit=bool(set(of_runs(corrected.recording, corrected.columns)) & set(known.fingerprints)),
         accuracy=accuracy,
         initial=corrected.initial,
@@ -104,7 +105,7 @@ def check(
             *recording.warnings,
             *corrected.notes,
             *_accuracy_warnings(accuracy),
-            *(_growth_warning(each) for each in outputs if clearly_larger(each.growth) and not each.failure),
+            *(_growth_warning(each) for each in outputs if clearly_grown(each.growth) and not each.failure),
             *_claim_warnings(model, any_claim=any_claim),
         ),
         traces=CheckTraces(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -66,6 +67,20 @@ class Prediction:
     def residual(self) -> Float[Tensor, "N m"]:
         """Measured minus simulated outputs; nan where an output is missing."""
         return self.measured - self.simulated
+
+    @property
+    def explained(self) -> tuple[float, ...]:
+        """Share of each output's variance that the simulation explains in the predicted samples.
+
+        It is nan where the measured values are the same in all samples, and for a magnetometer.
+        """
+        shares = []
+        for measured, residual in zip(self.measured.unbind(-1), self.residual.unbind(-1), strict=True):
+            seen = self.predicted & measured.isfinite()
+            variance = float(measured[seen].var(correction=0)) if bool(seen.any()) else 0.0
+            left = float(residual[seen].square().mean()) if variance > 0.0 else 0.0
+            shares.append(1.0 - left / variance if variance > 0.0 else math.nan)
+        return tuple(shares)
 
 
 def predict(model: DiagnosedModel, recording: Recording, start_seconds: float | None = None) -> Prediction:

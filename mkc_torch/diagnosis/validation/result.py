@@ -30,6 +30,8 @@ class OutputCheck:
         training: RMSE of the simulation with the findings in the diagnosed recording, predicted in the same way.
         ratio: corrected over baseline, with its 95 % interval.
         growth: corrected over training, with its 95 % interval.
+        explained: share of the output's variance that the simulation with the findings explains in the predicted
+            samples; nan for a magnetometer.
         claimed: whether the findings make the residual of this output clearly smaller in the diagnosed recording.
         failure: why the model does not hold in this output; empty if it does.
     """
@@ -41,6 +43,7 @@ class OutputCheck:
     training: float
     ratio: Ratio
     growth: Ratio
+    explained: float
     claimed: bool
     failure: str
 
@@ -153,6 +156,7 @@ def _output(each: OutputCheck) -> dict[str, Any]:
         "ratio_interval": [_finite(each.ratio.low), _finite(each.ratio.high)],
         "growth": _finite(each.growth.value),
         "growth_interval": [_finite(each.growth.low), _finite(each.growth.high)],
+        "explained": _finite(each.explained),
         "claimed": each.claimed,
         "failure": each.failure,
     }
