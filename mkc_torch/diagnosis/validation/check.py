@@ -28,12 +28,14 @@ def check(
 
     Both simulations, without and with the findings, keep the parameters of their fits to the diagnosed recording. Their
     initial states are estimated from the first part of each trajectory, and the rest is predicted in open loop; a model
-    with ``restart_after`` is predicted in the segments that it was fitted with. The model holds if in every output that
-    the findings improve in the diagnosed recording, by 5 % or more, the 95 % interval of the ratio of the root mean
-    squares, with over without findings, is below 1, and no other output gets clearly worse, and the simulation
-    follows the recording at all. A model without such an
-    output holds if no residual is clearly larger than in the diagnosed recording. A magnetometer's model is checked by
+    with ``restart_after`` is predicted in the segments that it was fitted with. A magnetometer's model is checked by
     the spread of the corrected field's length about its median.
+
+    The model holds if every output that the findings make clearly better in the diagnosed recording is clearly better
+    with them in this one, no other output is clearly worse, and the simulation follows the recording at all. Clearly
+    means that the root mean square changes by 5 % or more, and that the 95 % interval of the ratio, with over without
+    findings, does not contain 1. A model without such an output holds if no residual is clearly larger than in the
+    diagnosed recording: more than 1.5 times, with the interval above 1.
 
     Args:
         model: such as ``Diagnosis.model``, or :meth:`mkc_torch.diagnosis.DiagnosedModel.from_json` with its simulation.

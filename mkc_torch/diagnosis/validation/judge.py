@@ -22,9 +22,16 @@ def claims(training: OutputTraining | None) -> bool:
         >>> claims(OutputTraining(before, BlockSquares((1.0, 1.2, 0.8), (9, 9, 9)))), claims(None)
         (True, False)
     """
-    if training is None:
-        return False
-    ratio = paired_ratio(training.corrected, training.baseline)
+    return training is not None and clearly_smaller(paired_ratio(training.corrected, training.baseline))
+
+
+def clearly_smaller(ratio: Ratio) -> bool:
+    """Whether a residual is clearly smaller: by 5 % or more, with the interval of the ratio below 1.
+
+    Example:
+        >>> clearly_smaller(Ratio(0.8, 0.7, 0.9)), clearly_smaller(Ratio(0.98, 0.97, 0.99))
+        (True, False)
+    """
     return ratio.value <= 1.0 - SMALL and ratio.high < 1.0
 
 
@@ -64,8 +71,8 @@ def judged(
 ) -> OutputCheck:
     """Return the check of an output.
 
-    A claimed output fails unless the interval of corrected over baseline is below 1; another output fails if its
-    residual is clearly larger with the findings. A model that claims nothing in any output fails in an output whose
+    A claimed output fails unless its residual is clearly smaller with the findings; another output fails if it is
+    clearly larger. A model that claims nothing in any output fails in an output whose
     residual is clearly larger than in the diagnosed recording.
 
     Args:
@@ -83,7 +90,7 @@ def judged(
     failure = ""
     if not math.isfinite(new.corrected.rmse):
         failure = f"{name}: it has no predicted samples."
-    elif claimed and not ratio.high < 1.0:
+    elif claimed and not clearly_smaller(ratio):
         failure = f"{name}: the findings do not make the residual clearly smaller: {_with_interval(ratio)} times."
     elif findings and clearly_larger(ratio):
         failure = f"{name}: the findings make the residual clearly larger: {_with_interval(ratio)} times."
@@ -115,8 +122,8 @@ def _lost(each: OutputCheck) -> str:
         return ""
     share = f"{max(each.explained, 0.0):.0%} of the variance" if each.explained > 0 else "nothing of the variance"
     return (
-        f"{plain(each.output)}: the simulation with the findings does not follow the recording: it explains {share}. If "
-        "its free run leaves any recording, diagnose with `restart_after`."
+        f"{plain(each.output)}: the simulation with the findings does not follow the recording: it explains {share}. "
+        "If its free run leaves any recording, diagnose with `restart_after`."
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from mkc_torch._support.drawing import BLUE, GREY, ORANGE, SHADE, array, style
 from mkc_torch._support.typesetting import plain
 from mkc_torch.diagnosis.validation.result import CheckTraces, RecordingCheck
-from mkc_torch.report.panels import Panels, title
+from mkc_torch.report.panels import Margins, Panels, title
 
 _MOST_OUTPUTS = 4
 """Outputs that are drawn."""
@@ -20,7 +20,7 @@ _MOST_POINTS = 2_000
 
 def overlay(check: RecordingCheck) -> str:
     """Draw each output and its residual without and with the findings; the first part is shaded. Returns HTML."""
-    traces, panels = check.traces, Panels(2)
+    traces, panels = check.traces, Panels(2, margins=Margins(left=0.95))
     time, rows = _axis(traces), _thinned(len(traces.time))
     with style():
         for number, each in enumerate(check.outputs[:_MOST_OUTPUTS]):

@@ -6,7 +6,7 @@ import math
 
 from mkc_torch._support.typesetting import plain
 from mkc_torch.diagnosis.validation.blocks import Ratio
-from mkc_torch.diagnosis.validation.result import OutputCheck, RecordingCheck
+from mkc_torch.diagnosis.validation.result import RecordingCheck
 from mkc_torch.report.words.numbers import size
 
 
@@ -48,7 +48,7 @@ def ratio(value: Ratio) -> str:
     return f"{value.value:.2f} ({value.low:.2f} to {value.high:.2f})"
 
 
-def rmse(value: float, unit: str) -> str:
+def rmse(value: float, unit: str = "") -> str:
     """Return a root mean square with its unit.
 
     Example:
@@ -56,8 +56,3 @@ def rmse(value: float, unit: str) -> str:
         ('0.0123 rad', '—')
     """
     return f"{size(value)} {plain(unit)}".rstrip() if math.isfinite(value) else "—"
-
-
-def role(each: OutputCheck) -> str:
-    """Return what the findings do to an output in the diagnosed recording."""
-    return "improved there too" if each.claimed else "not improved there"
