@@ -23,6 +23,7 @@ from mkc_torch.diagnosis.io.model import refuse_unknown
 from mkc_torch.recording.kept_columns import write_with_columns
 from mkc_torch.recording.recording import Recording, write_table
 from mkc_torch.report.words.numbers import size
+from mkc_torch.simulation import Dynamics, Static
 from mkc_torch.simulation.magnetometer import Magnetometer
 
 if TYPE_CHECKING:
@@ -77,7 +78,8 @@ def show_correction(table: Recording, corrected: Corrected, output: Path) -> Non
         console.print(f"warning: {missing} of {len(values)} rows have no finite {what}.", soft_wrap=True)
     if not is_field:
         sizes = [
-            f"RMSE of {name} {size(value)} {table.units[name]}".rstrip() for name, value in corrected.residuals.items()
+            f"RMSE of {name} {size(value)} {corrected.units.get(name, table.units[name])}".rstrip()
+            for name, value in corrected.residuals.items()
         ]
         summary = ", ".join([f"{len(values):,} rows of {', '.join(columns)} simulated with the findings", *sizes])
     elif missing < len(values):
@@ -111,6 +113,7 @@ class Corrected:
         length: length of the field in the calibrated recording, if known.
         notes: sentences on effects that were not applied.
         residuals: root mean square of measured minus simulated values, by output.
+        units: of the simulation's quantities, by name.
     """
 
     columns: dict[str, Tensor]
@@ -118,6 +121,7 @@ class Corrected:
     length: float | None
     notes: tuple[str, ...]
     residuals: Mapping[str, float] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_correction(path: Path, simulation: Simulation | None = None) -> Calibration | DiagnosedModel:
@@ -163,7 +167,9 @@ def correct(known: Calibration | DiagnosedModel, recording: Recording) -> Correc
         return Corrected(columns, unit, length if isinstance(length, float) else None, notes)
     residuals = {name: _rmse(recording, columns, name) for name in columns if name not in _NOT_MEASURED}
     named = {name if name in _NOT_MEASURED else f"{name}_simulated": values for name, values in columns.items()}
-    return Corrected(named, "", None, notes, {name: size for name, size in residuals.items() if math.isfinite(size)})
+    known_residuals = {name: value for name, value in residuals.items() if math.isfinite(value)}
+    units = known.source.units if isinstance(known.source, Dynamics | Static) else {}
+    return Corrected(named, "", None, notes, known_residuals, units)
 
 
 def _rmse(recording: Recording, columns: Mapping[str, Tensor], name: str) -> float:

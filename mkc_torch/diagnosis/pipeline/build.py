@@ -38,6 +38,7 @@ from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import NamingSettings, NoiseSettings
 from mkc_torch.diagnosis.validation.fingerprint import measured_columns
+from mkc_torch.diagnosis.validation.predict import with_measured
 from mkc_torch.diagnosis.validation.training import with_baseline, with_training
 from mkc_torch.diagnosis.verdict import (
     FitAssessment,
@@ -233,7 +234,7 @@ def _model(whole: DiagnosisInputs, final: FinalEstimate) -> DiagnosedModel:
     base = whole.base.fit if whole.base.free is None else whole.base.free
     prepared = base.model.prepared
     parameters = own_parameters(prepared, base.parameters)
-    recording = prepared.recording if prepared.dynamics is None else prepared.dynamics.whole
+    recording = with_measured(prepared)
     columns = measured_columns(recording, prepared.channels)
     work = partial(with_training, model, parameters, prepared.state, recording, columns)
     bare = with_baseline(model, parameters, prepared.state)

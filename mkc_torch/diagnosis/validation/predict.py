@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from mkc_torch.diagnosis.goodness_of_fit import units_of
 from mkc_torch.diagnosis.io.model import DiagnosedModel, correction_of
 from mkc_torch.diagnosis.validation.first_part import checked_start, enough_seconds
 from mkc_torch.recording.recording import Recording
@@ -17,7 +17,7 @@ from mkc_torch.simulation.dynamics import Dynamics
 from mkc_torch.simulation.dynamics.correction import DynamicsCorrection
 from mkc_torch.simulation.magnetometer import Magnetometer
 from mkc_torch.simulation.parameter import SimulationError
-from mkc_torch.simulation.protocol import Simulation
+from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 from mkc_torch.simulation.runs import experiment_runs
 
 if TYPE_CHECKING:
@@ -144,12 +144,11 @@ def _of_dynamics(model: DiagnosedModel, recording: Recording, start_seconds: flo
     measured = prepared.measured
     if prepared.recorded is not None:
         measured = torch.where(prepared.recorded, measured, torch.nan)
-    units = {**dict(prepared.recording.units), **dict(prepared.system.units)}
     return Prediction(
         prepared.whole,
         prepared.channels,
         prepared.channels,
-        tuple(units.get(name, "") for name in prepared.channels),
+        units_of(prepared),
         prepared.time,
         prepared.run,
         measured,
@@ -164,23 +163,43 @@ def _of_dynamics(model: DiagnosedModel, recording: Recording, start_seconds: flo
 
 def _of_outputs(model: DiagnosedModel, source: Simulation, recording: Recording) -> Prediction:
     prepared = source.prepare(recording)
-    table = prepared.recording
+    table, units = with_measured(prepared), dict(zip(prepared.channels, units_of(prepared), strict=True))
     correction = correction_of(model.simulation, model.state, table, source)
     changes, notes = model.changes(correction)
     found = correction.corrected(model.theta, changes)
     outputs = tuple(name for name in found if name not in ("time", "experiment"))
-    units: Mapping[str, str] = getattr(source, "units", {})
     return Prediction(
         table,
         outputs,
         outputs,
-        tuple(units.get(name, table.units[name]) for name in outputs),
+        tuple(units.get(name, "") for name in outputs),
         correction.time,
         _runs(table),
         table.stack(*outputs),
         torch.stack([found[name] for name in outputs], -1).detach(),
         torch.ones(len(table), dtype=torch.bool),
         notes=notes,
+    )
+
+
+def with_measured(prepared: PreparedSimulation) -> Recording:
+    """Return the recording of a prepared simulation with all measured columns, and with missing outputs as nan.
+
+    A simulator's output is prepared with a recording without the compared columns.
+    """
+    if prepared.dynamics is not None:
+        return prepared.dynamics.whole
+    table = prepared.recording
+    if prepared.measured.shape[-1] != len(prepared.channels) or all(name in table for name in prepared.channels):
+        return table
+    units = dict(zip(prepared.channels, units_of(prepared), strict=True))
+    columns = dict(zip(prepared.channels, prepared.measured.unbind(-1), strict=True))
+    return Recording(
+        {**table.columns, **columns},
+        name=table.name,
+        units={**table.units, **units},
+        warnings=table.warnings,
+        labels=table.labels,
     )
 
 
