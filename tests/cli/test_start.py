@@ -9,7 +9,7 @@ pytest.importorskip("typer")
 pytest.importorskip("polars")
 
 from mkc_torch.cli import diagnosis_request
-from mkc_torch.diagnosis.pipeline import prepare
+from mkc_torch.diagnosis import declared
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.recording.recording import write_table
 
@@ -81,4 +81,4 @@ def test_a_calibration_loads_no_compiler(tmp_path):
 def test_defaults_of_the_command_line_equal_those_of_diagnose():
     module = sys.modules["mkc_torch.diagnosis.diagnose"]
     assert (diagnosis_request.LEVEL, diagnosis_request.SURROGATES) == (module.LEVEL, module.SURROGATES)
-    assert diagnosis_request.INPUT_HOLDS == prepare.BETWEEN
+    assert diagnosis_request.INPUT_HOLDS == declared.BETWEEN
