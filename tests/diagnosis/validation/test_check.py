@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,9 +14,12 @@ from mkc_torch.diagnosis.io.model import ModelFileError
 from mkc_torch.diagnosis.io.training import BlockSquares, OutputTraining
 from mkc_torch.diagnosis.validation.fingerprint import of_runs
 from mkc_torch.diagnosis.validation.judge import judged, unless_lost
+from mkc_torch.diagnosis.validation.result import SCHEMA
 from mkc_torch.diagnosis.validation.training import with_training
 from mkc_torch.simulation import Magnetometer, Paired, Static
 from tests.diagnosis.validation.tank import Tank, tank_model, tank_recording, two_runs, usual_model
+
+SCHEMA_FILE = Path(mkc_torch.__file__).parent / "diagnosis" / "io" / "schema" / "check_1.schema.json"
 
 
 def test_findings_that_repeat_hold():
@@ -202,16 +206,17 @@ def test_a_simulation_that_loses_the_recording_does_not_hold():
 
 @pytest.mark.e2e
 def test_the_json_has_every_number():
+    """All keys are required by the schema, and no other is allowed."""
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = json.loads(SCHEMA_FILE.read_text(encoding="utf-8"))
     content = json.loads(check(usual_model(), tank_recording(1)).to_json())
-    assert sorted(content) == [
-        "accuracy", "findings", "outputs", "predicted", "reasons", "recording", "samples", "schema", "segment_seconds",
-        "simulation", "start_seconds", "used_in_fit", "verdict", "warnings",
-    ]  # fmt: skip
-    assert content["schema"] == "mkc-check/1"
-    assert sorted(content["outputs"]["level"]) == [
-        "claimed", "explained", "failure", "growth", "growth_interval", "ratio", "ratio_interval", "rmse_baseline",
-        "rmse_corrected", "rmse_training", "unit",
-    ]  # fmt: skip
+    jsonschema.validate(content, schema, jsonschema.Draft202012Validator)
+    assert schema["properties"]["schema"] == {"const": SCHEMA}
+    short = check(usual_model(), tank_recording(1).rows(torch.arange(9)))
+    assert short.to_dict()["outputs"]["level"]["growth_interval"]
+    jsonschema.validate(json.loads(short.to_json()), schema, jsonschema.Draft202012Validator)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({**content, "more": 1}, schema)
 
 
 @pytest.mark.e2e
