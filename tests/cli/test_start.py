@@ -39,7 +39,9 @@ def run_without_heavy_imports(*arguments):
     )
 
 
-@pytest.mark.parametrize("command", [(), ("diagnose",), ("calibrate",), ("apply",), ("demo",), ("effects",)])
+@pytest.mark.parametrize(
+    "command", [(), *((name,) for name in ("diagnose", "calibrate", "apply", "check", "demo", "effects"))]
+)
 def test_help_loads_no_heavy_dependency(command):
     done = run_without_heavy_imports(*command, "--help")
     assert (done.returncode, done.stderr) == (0, "")
