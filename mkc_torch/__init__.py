@@ -19,7 +19,9 @@ __all__ = [
     "MKCLoss",
     "NotIdentifiableError",
     "Recording",
+    "RecordingCheck",
     "beyond_bound",
+    "check",
     "diagnose",
     "fit_density",
     "fit_kernels",
@@ -38,6 +40,8 @@ if TYPE_CHECKING:
     from mkc_torch.density import DensityFit, KernelsFit, MKCDistribution, fit_density, fit_kernels
     from mkc_torch.diagnosis.diagnose import diagnose
     from mkc_torch.diagnosis.result import Diagnosis
+    from mkc_torch.diagnosis.validation.check import check
+    from mkc_torch.diagnosis.validation.result import RecordingCheck
     from mkc_torch.losses import (
         GeneralizedCrossEntropyLoss,
         HeteroscedasticMKCLoss,
@@ -59,7 +63,7 @@ else:
     _HOMES = {
         "calibration": ("EllipsoidFit", "NotIdentifiableError"),
         "density": ("DensityFit", "KernelsFit", "MKCDistribution", "fit_density", "fit_kernels"),
-        "diagnosis": ("Diagnosis", "diagnose"),
+        "diagnosis": ("Diagnosis", "RecordingCheck", "check", "diagnose"),
         "losses": (
             "GeneralizedCrossEntropyLoss",
             "HeteroscedasticMKCLoss",

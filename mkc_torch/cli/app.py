@@ -11,6 +11,7 @@ from typer.core import TyperGroup
 
 from mkc_torch.cli.apply import apply
 from mkc_torch.cli.calibrate import calibrate
+from mkc_torch.cli.check import check
 from mkc_torch.cli.demo import demo
 from mkc_torch.cli.diagnose import diagnose
 from mkc_torch.cli.doctor import doctor
@@ -66,6 +67,7 @@ def _all_commands(
 app.command(short_help="Find the physics that a simulation lacks.")(diagnose)
 app.command(short_help="Calibrate a magnetometer or an accelerometer.")(calibrate)
 app.command(short_help="Correct a recording with a calibration or a model.")(apply)
+app.command(short_help="Check a model on recordings that no fit has used.")(check)
 app.command(short_help="Write a calibration for an autopilot, ROS or C.")(export)
 app.command(short_help="Show what a file holds, and which commands take it.")(inspect)
 app.command(short_help="List the effects, and where each can act in a simulation.")(effects)

@@ -47,8 +47,9 @@ def apply(
     """Correct a recording with a calibration or a model, and keep the recording's other columns.
 
     For a magnetometer, the columns field_x, field_y and field_z are added: the corrected field of each row. For your
-    own simulation, or a simulator's output, the columns of the outputs are replaced: they are simulated with the
-    findings. Findings that belong to the time or place of the diagnosed recording are not applied.
+    own simulation, or a simulator's output, a column NAME_simulated is added for each output, simulated with the
+    findings, and the RMSE of the measured column is printed; no measured column is replaced. Findings that belong to
+    the time or place of the diagnosed recording are not applied.
     """
     names, units = parsed_columns(columns), parsed_units(convert or [], unit_label)
     if simulation is not None and simulator_output is not None:

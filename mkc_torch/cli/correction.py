@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,8 @@ from mkc_torch.diagnosis.io.model import refuse_unknown
 from mkc_torch.recording.kept_columns import write_with_columns
 from mkc_torch.recording.recording import Recording, write_table
 from mkc_torch.report.words.numbers import size
+from mkc_torch.simulation import Dynamics, Static
+from mkc_torch.simulation.magnetometer import Magnetometer
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -74,7 +77,11 @@ def show_correction(table: Recording, corrected: Corrected, output: Path) -> Non
         what = "field" if is_field else f"value of {', '.join(columns)}"
         console.print(f"warning: {missing} of {len(values)} rows have no finite {what}.", soft_wrap=True)
     if not is_field:
-        summary = f"{len(values):,} rows of {', '.join(columns)} simulated with the findings"
+        sizes = [
+            f"RMSE of {name} {size(value)} {corrected.units.get(name, table.units[name])}".rstrip()
+            for name, value in corrected.residuals.items()
+        ]
+        summary = ", ".join([f"{len(values):,} rows of {', '.join(columns)} simulated with the findings", *sizes])
     elif missing < len(values):
         length = float(torch.linalg.vector_norm(values, dim=-1).nanmedian())
         if sentence := _other_length(length, corrected):
@@ -105,12 +112,16 @@ class Corrected:
         unit: unit of the corrected field, if known.
         length: length of the field in the calibrated recording, if known.
         notes: sentences on effects that were not applied.
+        residuals: root mean square of measured minus simulated values, by output.
+        units: of the simulation's quantities, by name.
     """
 
     columns: dict[str, Tensor]
     unit: str
     length: float | None
     notes: tuple[str, ...]
+    residuals: Mapping[str, float] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_correction(path: Path, simulation: Simulation | None = None) -> Calibration | DiagnosedModel:
@@ -143,12 +154,43 @@ def read_correction(path: Path, simulation: Simulation | None = None) -> Calibra
 
 
 def correct(known: Calibration | DiagnosedModel, recording: Recording) -> Corrected:
-    """Correct a recording with a calibration or a model."""
+    """Correct a recording with a calibration or a model.
+
+    Simulated outputs are named ``NAME_simulated``, so that they replace no measured column.
+    """
     if isinstance(known, Calibration):
         return Corrected(known.apply(recording), known.field_unit, known.field_strength, ())
     columns, notes = known.correct(recording)
-    length = known.state.get("strength")
-    return Corrected(columns, str(known.state.get("unit", "")), length if isinstance(length, float) else None, notes)
+    if known.simulation == Magnetometer.name:
+        length = known.state.get("strength")
+        unit = str(known.state.get("unit", ""))
+        return Corrected(columns, unit, length if isinstance(length, float) else None, notes)
+    residuals = {name: _rmse(recording, columns, name) for name in columns if name not in _NOT_MEASURED}
+    named = {name if name in _NOT_MEASURED else f"{name}_simulated": values for name, values in columns.items()}
+    known_residuals = {name: value for name, value in residuals.items() if math.isfinite(value)}
+    units = known.source.units if isinstance(known.source, Dynamics | Static) else {}
+    return Corrected(named, "", None, notes, known_residuals, units)
+
+
+def _rmse(recording: Recording, columns: Mapping[str, Tensor], name: str) -> float:
+    """Return the root mean square of measured minus simulated values; nan if none was measured.
+
+    The simulated rows can be fewer than those of the recording, and sorted: they are matched by run and time.
+    """
+    if name not in recording:
+        return math.nan
+    rows = zip(_keys(recording, len(recording)), recording[name].tolist(), strict=True)
+    measured = dict(reversed(list(rows)))  # of repeated times the first is simulated
+    keys = _keys(columns, len(columns[name]))
+    pairs = [(measured.get(key, math.nan), value) for key, value in zip(keys, columns[name].tolist(), strict=True)]
+    squares = [(known - value) ** 2 for known, value in pairs if math.isfinite(known) and math.isfinite(value)]
+    return math.sqrt(sum(squares) / len(squares)) if squares else math.nan
+
+
+def _keys(table: Recording | Mapping[str, Tensor], count: int) -> list[tuple[float, ...]]:
+    """Return run and time of each row; its number without a time."""
+    known = [table[name].tolist() for name in ("experiment", "time") if name in table]
+    return list(zip(*known, strict=True)) if "time" in table else [(float(row),) for row in range(count)]
 
 
 def correct_as_messages(known: Calibration | DiagnosedModel, recording: Recording) -> Corrected:

@@ -26,7 +26,6 @@ from mkc_torch.cli.console import (
     refuse_same_names,
 )
 from mkc_torch.cli.diagnosis_request import (
-    INPUT_HOLDS,
     LEVEL,
     MAX_FINDINGS,
     SIMULATIONS,
@@ -40,9 +39,11 @@ from mkc_torch.cli.loading import loading
 from mkc_torch.cli.simulation_option import (
     COLUMNS_HELP,
     COLUMNS_METAVAR,
+    INPUT_HOLD_HELP,
     OWN_SIMULATION,
     RUN_COLUMN_HELP,
     checked_columns,
+    checked_input_hold,
     checked_sensor,
     checked_simulation,
     checked_units,
@@ -102,7 +103,7 @@ def diagnose(
     ] = None,
     input_hold: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=HOLD", help=f"Known course of an input between samples: {', '.join(INPUT_HOLDS)}."),
+        typer.Option(metavar="NAME=HOLD", help=INPUT_HOLD_HELP),
     ] = None,
     suspect: Annotated[
         list[str] | None,
@@ -143,7 +144,7 @@ def diagnose(
         units=checked_units(conversions, unit_label, simulation),
         sensor=checked_sensor(sensor, simulation),
         noise=_noise(noise or []),
-        input_hold=_input_hold(input_hold or []),
+        input_hold=checked_input_hold(input_hold or []),
         suspect=tuple(suspect or []),
         level=_level(level),
         surrogates=_surrogates(surrogates, level, quick=quick),
@@ -255,14 +256,6 @@ def _noise(texts: list[str]) -> dict[str, float]:
                 "estimated."
             )
     return sizes
-
-
-def _input_hold(texts: list[str]) -> dict[str, str]:
-    pairs = parsed_pairs("--input-hold", texts, "torque=held")
-    for name, hold in pairs.items():
-        if hold not in INPUT_HOLDS:
-            raise typer.BadParameter(f'--input-hold {name}="{hold}" is unknown; known: {", ".join(INPUT_HOLDS)}.')
-    return pairs
 
 
 def _level(level: float) -> float:

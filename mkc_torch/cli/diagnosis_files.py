@@ -277,10 +277,15 @@ def simulation_of(request: Request) -> Simulation:
 
 
 def _failed(path: Path, label: str, error: Exception) -> Outcome:
+    return Outcome(failure_sentence(path, label, error), failed=True)
+
+
+def failure_sentence(path: Path, label: str, error: Exception) -> str:
+    """Return the sentence on a recording, or a run of it, that could not be used."""
     subject = f"{path}, run {label}" if label else str(path)
     sentence = sentence_of(error) if isinstance(error, FAILURES) else _unexpected(error)
     sentence = sentence.removeprefix(f"{path.stem}/{label}: " if label else f"{path.stem}: ")  # the path has it already
-    return Outcome(sentence if sentence.startswith(subject) else f"{subject}: {sentence}", failed=True)
+    return sentence if sentence.startswith(subject) else f"{subject}: {sentence}"
 
 
 def _unexpected(error: Exception) -> str:

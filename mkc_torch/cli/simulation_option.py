@@ -6,8 +6,8 @@ from pathlib import Path
 
 import typer
 
-from mkc_torch.cli.console import parsed_columns
-from mkc_torch.cli.diagnosis_request import MAGNETOMETER, SIMULATIONS, is_file_of_a_simulation
+from mkc_torch.cli.console import parsed_columns, parsed_pairs
+from mkc_torch.cli.diagnosis_request import INPUT_HOLDS, MAGNETOMETER, SIMULATIONS, is_file_of_a_simulation
 from mkc_torch.cli.units_option import parsed_units
 
 OWN_SIMULATION = "FILE.py:CLASS, FILE.py with a single class, or MODEL.fmu. The code in the file is run."
@@ -15,6 +15,7 @@ OWN_SIMULATION = "FILE.py:CLASS, FILE.py with a single class, or MODEL.fmu. The 
 
 COLUMNS_METAVAR = "NAME=COLUMN,..."
 COLUMNS_HELP = "Names of the columns in the file: mag_x=mx,temperature=IMU_T"
+INPUT_HOLD_HELP = f"Known course of an input between samples: {', '.join(INPUT_HOLDS)}."
 RUN_COLUMN_HELP = "Column that separates the runs of a table; default: experiment, if any."
 
 
@@ -92,3 +93,20 @@ def checked_sensor(sensor: str | None, simulation: str | None) -> str | None:
     if sensor is not None and simulation not in (None, MAGNETOMETER):
         raise typer.BadParameter("--sensor names a magnetometer; your own simulation takes columns by name.")
     return sensor
+
+
+def checked_input_hold(texts: list[str]) -> dict[str, str]:
+    """Return the hold by input, from ``--input-hold``. The names are checked when the simulation is loaded.
+
+    Raises:
+        typer.BadParameter: a part is not a pair, or the hold is unknown.
+
+    Example:
+        >>> checked_input_hold(["torque=held"])
+        {'torque': 'held'}
+    """
+    pairs = parsed_pairs("--input-hold", texts, "torque=held")
+    for name, hold in pairs.items():
+        if hold not in INPUT_HOLDS:
+            raise typer.BadParameter(f'--input-hold {name}="{hold}" is unknown; known: {", ".join(INPUT_HOLDS)}.')
+    return pairs

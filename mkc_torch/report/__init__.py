@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mkc_torch.report.calibration.page import Comparison, calibration_report, refusal_report
+    from mkc_torch.report.check.page import check_report
     from mkc_torch.report.diagnosis.page import diagnosis_report
 
-__all__ = ["Comparison", "calibration_report", "diagnosis_report", "refusal_report"]
+__all__ = ["Comparison", "calibration_report", "check_report", "diagnosis_report", "refusal_report"]
 
 _HOMES = {
     "Comparison": "calibration.page",
     "calibration_report": "calibration.page",
+    "check_report": "check.page",
     "diagnosis_report": "diagnosis.page",
     "refusal_report": "calibration.page",
 }

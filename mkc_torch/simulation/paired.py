@@ -232,7 +232,7 @@ class PairedCorrection:
     """
 
     def __init__(self, system: Paired, state: Mapping[str, Any], recording: Recording) -> None:
-        self.channels = tuple(state["channels"])
+        self.channels, self.recording = tuple(state["channels"]), recording
         self._clock_limits = torch.tensor(state.get("clocks", ()), dtype=torch.float64)
         self.time = recording["time"]
         inside, self._curve = _match_runs(system.simulated.finite(*self.channels), recording, self.channels)

@@ -228,10 +228,13 @@ class Correction(Protocol):
     """A fitted simulation on a new recording, for removing effects from it.
 
     Attributes:
+        recording: the N samples in use.
         time: (N,), in s.
         ports: ports at which an effect belongs to the sensor or system, and not to the place.
     """
 
+    @property
+    def recording(self) -> Recording: ...
     @property
     def time(self) -> Float[Tensor, " N"]: ...
     @property

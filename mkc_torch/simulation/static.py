@@ -329,7 +329,7 @@ class StaticCorrection:
     """
 
     def __init__(self, system: Static, fixed: Sequence[str], unscaled: Sequence[str], recording: Recording) -> None:
-        self.system = system
+        self.system, self.recording = system, recording
         self.time = torch.arange(len(recording)).double() if recording.time is None else recording.time
         self.inputs = _inputs(system, recording)
         units = {name: system.units.get(name, "") for name in (*system.inputs, *system.outputs)}

@@ -9,7 +9,7 @@ pytest.importorskip("typer")
 pytest.importorskip("polars")
 
 from mkc_torch.cli import diagnosis_request
-from mkc_torch.diagnosis.pipeline import prepare
+from mkc_torch.diagnosis import declared
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.recording.recording import write_table
 
@@ -39,7 +39,9 @@ def run_without_heavy_imports(*arguments):
     )
 
 
-@pytest.mark.parametrize("command", [(), ("diagnose",), ("calibrate",), ("apply",), ("demo",), ("effects",)])
+@pytest.mark.parametrize(
+    "command", [(), *((name,) for name in ("diagnose", "calibrate", "apply", "check", "demo", "effects"))]
+)
 def test_help_loads_no_heavy_dependency(command):
     done = run_without_heavy_imports(*command, "--help")
     assert (done.returncode, done.stderr) == (0, "")
@@ -82,4 +84,4 @@ def test_defaults_of_the_command_line_equal_those_of_diagnose():
     module = sys.modules["mkc_torch.diagnosis.diagnose"]
     for name in ("LEVEL", "SURROGATES", "MAX_FINDINGS"):
         assert getattr(diagnosis_request, name) == getattr(module, name)
-    assert diagnosis_request.INPUT_HOLDS == prepare.BETWEEN
+    assert diagnosis_request.INPUT_HOLDS == declared.BETWEEN

@@ -18,6 +18,7 @@ MANUAL = {
     "bad_inputs.md",
     "calibrate.md",
     "changelog.md",
+    "check.md",
     "diagnose.md",
     "estimators.md",
     "for_networks.md",
@@ -105,7 +106,7 @@ def test_commands_and_options_in_inline_code_exist(page):
             assert options <= known, f"{page.name}: `{text}`"
 
 
-@pytest.mark.parametrize("command", ["calibrate", "diagnose"])
+@pytest.mark.parametrize("command", ["calibrate", "check", "diagnose"])
 def test_every_option_is_documented(command):
     named = " ".join(inline(ROOT / "docs" / f"{command}.md"))
     assert {option for option in mkc_options(command) if option not in named} == set()

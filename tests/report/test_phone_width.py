@@ -12,10 +12,11 @@ pytest.importorskip("jinja2")
 
 from examples.blind_proof.page import proof_page
 from examples.blind_proof.score import ProofScore
+from mkc_torch import check
 from mkc_torch.calibration.calibrate import calibrate
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.recording.demonstration import simulated_recording
-from mkc_torch.report import Comparison, calibration_report, refusal_report
+from mkc_torch.report import Comparison, calibration_report, check_report, refusal_report
 from mkc_torch.report.diagnosis.page import diagnosis_report
 from tests.blind_proof import test_scenarios_score as scenario_score
 from tests.blind_proof.test_score import ADEQUATE, answer, finding, key, score
@@ -26,6 +27,7 @@ from tests.diagnosis.factory import (
     make_unfit,
     with_another_shape,
 )
+from tests.diagnosis.validation.tank import tank_recording, usual_model
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = (
@@ -124,6 +126,10 @@ def other_pages():
     with pytest.raises(NotIdentifiableError) as refused:
         calibrate(flat)
     yield "refusal", refusal_report(flat, refused.value)
+    checked = check(usual_model(), tank_recording(1, name=LONG))
+    output = dataclasses.replace(checked.outputs[0], output=LONG, unit=LONG, failure=f"{LONG} fails.")
+    checked = dataclasses.replace(checked, simulation=LONG, outputs=(output,), findings=(LONG,), warnings=(LONG,))
+    yield "check", check_report(checked)
     keys = [key(name, kind) for name, kind in (("a", "single"), ("b", "empty"), ("c", "single"), (LONG, "single"))]
     settings = scenario_score.SETTINGS | {"hidden": 3, LONG: LONG}
     result = score(keys, {"a": answer(finding("hard_iron_step")), "b": ADEQUATE, "c": answer(finding("offset_drift"))})

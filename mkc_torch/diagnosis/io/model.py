@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from mkc_torch.diagnosis.declared import checked_input_hold
 from mkc_torch.diagnosis.io.python_source import SourceError, python_source
+from mkc_torch.diagnosis.io.training import Training
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.joint import in_order_of_the_chain, summed
 from mkc_torch.diagnosis.model.term import Driver, Term, context_at
@@ -25,8 +27,8 @@ from mkc_torch.recording.recording import MissingColumnError, Recording
 from mkc_torch.simulation.dynamics import Dynamics
 from mkc_torch.simulation.magnetometer import Magnetometer
 from mkc_torch.simulation.paired import Paired
-from mkc_torch.simulation.ports import Change
-from mkc_torch.simulation.protocol import CorrectableSimulation, Correction, Simulation
+from mkc_torch.simulation.ports import Change, Changes
+from mkc_torch.simulation.protocol import CorrectableSimulation, Correction, PreparedSimulation, Simulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -48,6 +50,7 @@ class DiagnosedModel(CorrectingModel):
         terms: the effects, each with its driver's columns, their reference and units, and its shape.
         gammas: their γ.
         source: the user's simulation, which files do not contain.
+        reference: the recordings that the model was fitted to, and the simulation without findings; None if unknown.
 
     Attributes:
         theta: the simulation's parameters.
@@ -72,6 +75,7 @@ class DiagnosedModel(CorrectingModel):
         terms: Sequence[Term],
         gammas: Sequence[Float[Tensor, " q"]],
         source: Simulation | None = None,
+        reference: Training | None = None,
     ) -> None:
         super().__init__()
         self.simulation = simulation
@@ -80,6 +84,37 @@ class DiagnosedModel(CorrectingModel):
         self.gammas = nn.ParameterList(nn.Parameter(g.detach().clone(), requires_grad=False) for g in gammas)
         self.terms = tuple(terms)
         self.source = source
+        self.reference = reference
+
+    @property
+    def baseline(self) -> DiagnosedModel:
+        """The simulation without the findings, with the parameters of its own fit to the diagnosed recording.
+
+        Raises:
+            ValueError: these parameters are not known, because the file is of an earlier version.
+        """
+        known = self.reference
+        if known is None:
+            raise ValueError(
+                "the model does not hold the simulation without findings, which a check compares it with; diagnose the "
+                "recording again with this version."
+            )
+        theta = torch.tensor(known.parameters, dtype=torch.float64)
+        return DiagnosedModel(self.simulation, known.state, theta, (), (), self.source)
+
+    def with_input_hold(self, hold: Mapping[str, str]) -> DiagnosedModel:
+        """Return the model with other holds of its inputs, for a recording of another logger.
+
+        Args:
+            hold: "held", "linear" or "smooth", by input.
+
+        Raises:
+            ValueError: an input that the simulation does not have, or an unknown hold.
+        """
+        known = dict(self.state.get("input_hold", {}))
+        state = {**self.state, "input_hold": {**known, **checked_input_hold(hold, tuple(known))}}
+        gammas = list(self.gammas)
+        return DiagnosedModel(self.simulation, state, self.theta, self.terms, gammas, self.source, self.reference)
 
     def correct(self, recording: Recording) -> tuple[dict[str, Float[Tensor, " N"]], tuple[str, ...]]:
         """Return the corrected signal of a recording (N,), and notes on effects that do not transfer.
@@ -91,6 +126,18 @@ class DiagnosedModel(CorrectingModel):
             MissingColumnError: a column of the simulation, or an effect's driver, is missing.
         """
         correction = correction_of(self.simulation, self.state, recording, self.source)
+        changes, notes = self.changes(correction)
+        return correction.corrected(self.theta, changes), notes
+
+    def changes(self, correction: Correction) -> tuple[Changes, tuple[str, ...]]:
+        """Return the change by the effects at each port, and notes on effects that do not transfer.
+
+        Args:
+            correction: the simulation on a recording, which has the columns that drive the effects.
+
+        Raises:
+            MissingColumnError: an effect's driver is missing.
+        """
         changes: dict[str, Change] = {}
         notes = []
         for number in in_order_of_the_chain(self.terms, range(len(self.terms))):
@@ -100,22 +147,22 @@ class DiagnosedModel(CorrectingModel):
                 notes.append(f"{term.effect.id} depends on the location of the diagnosed recording and is left out.")
                 continue
             series = correction.ports[port].in_series(port)
-            change = self._change(term, gamma, correction, recording)
+            change = self._change(term, gamma, correction)
             changes[port] = summed(changes.get(port), change, series=series)
             if term.effect.persistent_change:
                 notes.append(
                     f"{term.effect.id} depends on the time of the diagnosed recording: its final change applies to "
                     "all samples."
                 )
-        return correction.corrected(self.theta, changes), tuple(notes)
+        return changes, tuple(notes)
 
     def forward(self, recording: Recording) -> dict[str, Float[Tensor, " N"]]:
         """Return the corrected signal, see :meth:`correct`."""
         return self.correct(recording)[0]
 
-    def _change(self, term: Term, gamma: Tensor, correction: Correction, recording: Recording) -> Change:
+    def _change(self, term: Term, gamma: Tensor, correction: Correction) -> Change:
         effect, shape = term.effect, term.shape
-        bare = _context(term, correction, recording)
+        bare = _context(term, correction)
 
         def change(signal: Tensor) -> Tensor:
             context = replace(bare, signal=signal)
@@ -146,6 +193,7 @@ class DiagnosedModel(CorrectingModel):
             "state": self.state,
             "parameters": self.theta.tolist(),
             "effects": terms,
+            **({} if self.reference is None else {"training": self.reference.to_dict()}),
         }
         return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
@@ -218,16 +266,20 @@ def model_of(fit: FittedModel, simulation: Simulation) -> DiagnosedModel:
         context = term.context(model.prepared, signals.get(term.port))
         terms.append(replace(term, shape=term.effect.bind(term.shape, context)))
     parameters = fit.parameters
-    of_recordings = {offset.name for offset in model.prepared.own_offsets}
-    own = [k for k, name in enumerate(model.prepared.parameter_names) if name not in of_recordings]
     return DiagnosedModel(
         model.prepared.name,
         model.prepared.state,
-        parameters[own],
+        own_parameters(model.prepared, parameters),
         terms,
         model.gammas(parameters),
         simulation,
     )
+
+
+def own_parameters(prepared: PreparedSimulation, parameters: Float[Tensor, " p"]) -> Float[Tensor, " q"]:
+    """Return the simulation's parameters and initial states, without the offsets of single recordings."""
+    of_recordings = {offset.name for offset in prepared.own_offsets}
+    return parameters[[k for k, name in enumerate(prepared.parameter_names) if name not in of_recordings]]
 
 
 def _columns(term: Term) -> tuple[Sequence[str], Sequence[float], Sequence[str]]:
@@ -248,9 +300,9 @@ def _read(content: Mapping[str, Any], known: Sequence[Effect], simulation: Simul
         shape = {name: _finite(value) for name, value in entry["shape"].items()}
         terms.append(Term(_effect(entry, known), driver, shape, entry.get("port", ""), entry.get("first", False)))
         gammas.append(_vector(entry["parameters"]))
-    return DiagnosedModel(
-        content["simulation"], content["state"], _vector(content["parameters"]), terms, gammas, simulation
-    )
+    known_fit = Training.from_dict(content["training"]) if "training" in content else None
+    theta = _vector(content["parameters"])
+    return DiagnosedModel(content["simulation"], content["state"], theta, terms, gammas, simulation, known_fit)
 
 
 def _effect(entry: Mapping[str, Any], known: Sequence[Effect]) -> Effect:
@@ -291,8 +343,8 @@ def _finite(value: Any) -> float:
     return float(value)
 
 
-def _context(term: Term, correction: Correction, recording: Recording) -> Context:
-    port, time = correction.ports[term.port], correction.time
+def _context(term: Term, correction: Correction) -> Context:
+    port, time, recording = correction.ports[term.port], correction.time, correction.recording
     drivers = time.new_zeros(len(time), 0)
     if term.driver is not None:
         for column in term.driver.columns:

@@ -115,7 +115,16 @@ def python_source(
     imports = "\n\n".join("\n".join(group) for group in groups if group)
     return (
         f'"""{kind.__name__}, with the findings of `mkc diagnose`; all numbers were fitted to its recording."""\n\n'
-        f"{imports}\n\n\n{text}\n"
+        f"{imports}\n\n\n{text}\n\n\n{_alone(kind)}"
+    )
+
+
+def _alone(kind: type) -> str:
+    """Return the lines for `python corrected.py NEW.csv`."""
+    return (
+        'if __name__ == "__main__":\n'
+        "    from mkc_torch.diagnosis.validation.alone import run_alone\n\n"
+        f"    run_alone(Corrected{kind.__name__})\n"
     )
 
 
@@ -188,6 +197,8 @@ def _states(system: Dynamics, memories: Mapping[str, str], theta: Sequence[float
         guesses |= {name: sum(begun) / len(begun)} if begun else {}
     text = ", ".join(json.dumps(name) for name in memories)
     lines = [f"    states = (*{base}.states, {text})"] if memories else []
+    tied = ", ".join(f"{json.dumps(name)}: {json.dumps(like)}" for name, like in memories.items())
+    lines += [f"    starts_as = {{**{base}.starts_as, {tied}}}"] if memories else []
     guessed = ", ".join(f"{json.dumps(name)}: {_rounded(value)!r}" for name, value in guesses.items())
     return [*lines, f"    initial = {{**{base}.initial, {guessed}}}"] if guessed else lines
 

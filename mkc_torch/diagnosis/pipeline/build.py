@@ -24,7 +24,7 @@ from mkc_torch.diagnosis.findings.reasons import reasons_of
 from mkc_torch.diagnosis.findings.shape import shape_of
 from mkc_torch.diagnosis.findings.warnings import evidence_warnings
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit
-from mkc_torch.diagnosis.io.model import model_of
+from mkc_torch.diagnosis.io.model import DiagnosedModel, model_of, own_parameters
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, estimate_noise, refit_open_loop
 from mkc_torch.diagnosis.model.shapes import described
@@ -38,6 +38,9 @@ from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Finding, Separ
 from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import NamingSettings, NoiseSettings
+from mkc_torch.diagnosis.validation.fingerprint import measured_columns
+from mkc_torch.diagnosis.validation.predict import with_measured
+from mkc_torch.diagnosis.validation.training import with_baseline, with_training
 from mkc_torch.diagnosis.verdict import (
     FitAssessment,
     Remainder,
@@ -194,7 +197,7 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
         candidates=_candidates(first),
         separability=separability(first) if first else _nothing_to_separate(),
         traces=_traces(prepared, whole.drivers, case.base, final),
-        model=model_of(counted_fit(final.fit, whole.base.fit, kept), whole.simulation),
+        model=_model(whole, counted_fit(final.fit, whole.base.fit, kept)),
         checks=(*prepared.checks, *_impossible(whole)),
         evidence=answers.of_all,
         environment=_environment(whole, known, unfit=unfit),
@@ -223,6 +226,21 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
     trail = Trail(whole.models, decided)
     diagnosis = replace(diagnosis, verdict=verdict_of(trail), decisions=trail)
     return replace(diagnosis, advice=advice_of(diagnosis))
+
+
+def _model(whole: DiagnosisInputs, fit: FittedModel) -> DiagnosedModel:
+    """Return the model with what a check compares new recordings with; after a stop, within the limit of a part."""
+    model = model_of(fit, whole.simulation)
+    base = whole.base.fit if whole.base.free is None else whole.base.free
+    prepared = base.model.prepared
+    parameters = own_parameters(prepared, base.parameters)
+    recording = with_measured(prepared)
+    columns = measured_columns(recording, prepared.channels)
+    work = partial(with_training, model, parameters, prepared.state, recording, columns)
+    bare = with_baseline(model, parameters, prepared.state)
+    if whole.stop is not None:
+        return within(_MOMENT_S, work) or bare
+    return optional("predicting the recording as in a check", work, lambda: bare)
 
 
 def is_flexible(term: Term) -> bool:

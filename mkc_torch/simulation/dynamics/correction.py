@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from mkc_torch.nonlinear import fit
 from mkc_torch.simulation.continuation import Continuation
+from mkc_torch.simulation.dynamics.initial_states import InitialStates, OwnStates
 from mkc_torch.simulation.dynamics.missing import recorded_weight
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.parameter import SimulationError
@@ -30,14 +32,14 @@ class DynamicsCorrection:
     Args:
         prepared: the differential equations with the new recording, which provides the inputs and the outputs for
             the estimate of the initial states.
-        first: s from the start of each run that the initial states are estimated from; None for the system's
+        first: s from the start of each trajectory that the initial states are estimated from; None for the system's
             ``initial_window``.
     """
 
     def __init__(self, prepared: PreparedDynamics, first: float | None = None) -> None:
         self.prepared = prepared
         self.first = prepared.system.initial_window if first is None else first
-        self.time = self.prepared.time
+        self.recording, self.time = self.prepared.recording, self.prepared.time
         self.ports = self.prepared.ports
 
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
@@ -49,31 +51,64 @@ class DynamicsCorrection:
         Raises:
             SimulationError: no trajectory is found.
         """
-        prepared = self.prepared
-        p = len(prepared.known)
+        outputs = self.simulated(theta, changes, self.initial_states(theta, changes))
+        table = self.prepared.recording
+        runs = {"experiment": table["experiment"]} if "experiment" in table else {}
+        return {"time": self.time} | runs | dict(zip(self.prepared.channels, outputs.unbind(-1), strict=True))
 
-        first = prepared.start()[p:]
+    def finer(self) -> DynamicsCorrection | None:
+        """The same with half the step of integration; None with the user's step or the smallest one."""
+        prepared = self.prepared.finer()
+        return None if prepared is None else DynamicsCorrection(prepared, self.first)
+
+    def simulated(self, theta: Float[Tensor, " p"], changes: Changes, starts: InitialStates) -> Float[Tensor, "N m"]:
+        """Simulate the outputs from known initial states, (N, m)."""
+        known = theta[: len(self.prepared.known)]
+        return self.prepared.simulated(torch.cat([known, starts.values]), changes, starts.near)
+
+    def initial_states(
+        self, theta: Float[Tensor, " p"], changes: Changes, start: Float[Tensor, " s"] | None = None
+    ) -> InitialStates:
+        """Estimate the initial states of all trajectories.
+
+        Args:
+            theta: (p,), the parameters.
+            changes: the changes at the ports.
+            start: (s,), values near the estimate; None for the first guess.
+
+        Raises:
+            SimulationError: no trajectory is found.
+        """
+        prepared = self.prepared
+        known = theta[: len(prepared.known)]
+        own = self.own_states
+        first = prepared.start()[len(known) :] if start is None else start
         # stiff friction can defeat Newton's method from the guess; the fit then starts from this trajectory
-        found = prepared.trajectory(torch.cat([theta[:p], first]), changes, patient=True)
+        found = prepared.trajectory(torch.cat([known, first]), changes, patient=True)
         if not found.converged:
             raise SimulationError(
                 f"{prepared.name}: no trajectory was found for this model's parameters and effects from the "
                 "initial states of this recording. Give a smaller `step`, or split the recording into shorter runs."
             )
-        begin = first
+        begin = own.free(first)
         near: Nearby | None = found
         for seen in self._horizons():
             if int(seen.sum()) > _SAMPLES_PER_STATE * len(begin) or bool(seen.all()) or self.first is not None:
                 weight = seen.to(theta.dtype)
                 if prepared.recorded is not None:
                     weight = recorded_weight(prepared.recorded, weight)
-                continuation = Continuation(prepared, lambda begin: (torch.cat([theta[:p], begin]), changes), near)
-                begin = fit(continuation, begin, weight=weight, covariance=None, graduate=True, max_iter=60).theta
+                continuation = Continuation(prepared, partial(_with_states, known, changes, own), near)
+                far = start is None
+                begin = fit(continuation, begin, weight=weight, covariance=None, graduate=far, max_iter=60).theta
                 near = continuation.near(begin)
-        outputs = prepared.simulated(torch.cat([theta[:p], begin]), changes, near)
-        table = prepared.recording
-        runs = {"experiment": table["experiment"]} if "experiment" in table else {}
-        return {"time": self.time} | runs | dict(zip(prepared.channels, outputs.unbind(-1), strict=True))
+        return InitialStates(own.all(begin), near)
+
+    @property
+    def own_states(self) -> OwnStates:
+        """Which initial states are estimated."""
+        system = self.prepared.system
+        trajectories = int(self.prepared.begins.sum())
+        return OwnStates.of(system.states, system.starts_as, trajectories)
 
     def _horizons(self) -> list[Bool[Tensor, " N"]]:
         """Masks of the samples that the initial states are fitted to, over growing horizons from each run's start.
@@ -85,3 +120,10 @@ class DynamicsCorrection:
         if self.first is not None:
             return [since <= self.first]
         return [since <= share * since.max() for share in _HORIZONS]
+
+
+def _with_states(
+    known: Float[Tensor, " p"], changes: Changes, own: OwnStates, begin: Float[Tensor, " f"]
+) -> tuple[Float[Tensor, " q"], Changes]:
+    """Return the parameters with the initial states, and the changes."""
+    return torch.cat([known, own.all(begin)]), changes

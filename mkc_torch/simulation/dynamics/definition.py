@@ -41,6 +41,8 @@ class Dynamics:
         step: largest step of integration in s; None to choose it by the recording.
         initial_window: s from the start of each run of a new recording that the initial states are estimated from;
             later samples are predicted. None for the whole run.
+        starts_as: states whose initial values in a new recording are not estimated, such as the memories of effects
+            in ``corrected.py``: each starts equal to the state that it is given, or at 0 if that is empty.
         joins_experiments: whether one fit uses all runs of a recording.
 
     Example:
@@ -71,6 +73,7 @@ class Dynamics:
     restart_after: float | None = None
     step: float | None = None
     initial_window: float | None = None
+    starts_as: Mapping[str, str] = {}
     joins_experiments: bool = True
     own_offsets: tuple[OwnOffset, ...] = ()
     measured: frozenset[str] = frozenset()

@@ -16,8 +16,8 @@ class Equations(Protocol):
 
     Attributes:
         name: name of the simulation in ``diagnosis.json``.
-        states, inputs, outputs, parameters, initial, units, input_hold, restart_after, step, initial_window: see
-            :class:`mkc_torch.simulation.Dynamics`.
+        states, inputs, outputs, parameters, initial, units, input_hold, restart_after, step, initial_window, starts_as:
+            see :class:`mkc_torch.simulation.Dynamics`.
         own_offsets: offsets of outputs in single recordings, the last parameters.
     """
 
@@ -43,6 +43,8 @@ class Equations(Protocol):
     def step(self) -> float | None: ...
     @property
     def initial_window(self) -> float | None: ...
+    @property
+    def starts_as(self) -> Mapping[str, str]: ...
     @property
     def own_offsets(self) -> tuple[OwnOffset, ...]: ...
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mkc_torch import Recording, diagnose
-from mkc_torch.diagnosis.pipeline.prepare import checked_input_hold, checked_noise
+from mkc_torch.diagnosis.declared import checked_input_hold, checked_noise
 from mkc_torch.simulation import Static
 from tests.diagnosis.swing import STEP, Pendulum
 

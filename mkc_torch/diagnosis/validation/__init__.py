@@ -1,0 +1,1 @@
+"""Validation of a corrected model on recordings that no fit has used."""
