@@ -25,6 +25,7 @@ from mkc_torch.diagnosis.model.process_noise import (
 from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time
+from mkc_torch.diagnosis.pipeline.lines import Lines, with_line
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.pipeline.suspected import suspected_models
@@ -54,7 +55,12 @@ _QUICK_MODELS = 8
 
 
 def search_models(
-    base: ProcessNoiseFit, terms: tuple[Term, ...], options: SearchOptions, generator: torch.Generator, keep: Keep
+    base: ProcessNoiseFit,
+    terms: tuple[Term, ...],
+    options: SearchOptions,
+    generator: torch.Generator,
+    keep: Keep,
+    lines: Lines = lambda _: None,
 ) -> StepwiseSearch:
     """Screen the candidates; if the strongest is significant, search the best set of effects and test each of them.
 
@@ -64,6 +70,7 @@ def search_models(
         options: of the diagnosis.
         generator: of the surrogates.
         keep: receives the search so far.
+        lines: the search for a line in a residual, whose candidates are searched with the others.
 
     Raises:
         NoFitError: the fit's trajectory is lost.
@@ -79,6 +86,9 @@ def search_models(
     if not terms:
         return replace(search, evidence=(_evidence(search, ground, options),), left=())
     first = _screened(fit, terms, options, generator)
+    others, line = first.p_value, lines(ground)
+    if line is not None and line.p_value <= options.level:
+        terms, first = (*terms, *line.terms), with_line(first, line, ground)
     keep(replace(search, first=first))
     search = replace(search, first=first, evidence=(_evidence(search, ground, options),))
     keep(search)
@@ -96,8 +106,10 @@ def search_models(
     if first.p_value > options.level:
         follow = _follow(beam) if not options.quick else ()
         return replace(search, left=(), first=replace(first, follow=follow))
-    tested = partial(_tested, search, beam=beam, base=base, options=options, generator=generator, keep=keep)
-    for chain in _in_turn(beam):
+    tested = partial(
+        _tested, search, others=others, lines=lines, beam=beam, base=base, options=options, generator=generator, keep=keep
+    )
+    for chain in [*_in_turn(beam), *_of_line(beam)]:
         found = _in_either_way(chain, beam, tested)
         # the simpler model counts as a rival only if all its effects are significant
         if 0 < len(found.found) < len(chain) and beam.best.key != chain[-1].key:
@@ -269,6 +281,8 @@ def _named(models: Sequence[Candidate], alone: Candidate) -> list[Candidate]:
 def _tested(
     search: StepwiseSearch,
     chain: Sequence[Candidate],
+    others: float,
+    lines: Lines,
     beam: BeamSearch,
     base: ProcessNoiseFit,
     options: SearchOptions,
@@ -277,15 +291,22 @@ def _tested(
 ) -> StepwiseSearch:
     """Add the effects of a chain of models one after the other as long as each is significant.
 
-    The null of each is the model with the effects before it, and all candidates are screened again.
+    The null of each is the model with the effects before it, and all candidates are screened again. A periodic effect
+    has the p-value of the line, all other effects that of the screening; ``others`` is that of the first.
     """
     for number, step in enumerate(chain):
         previous = search.found[-1].fit if search.found else base.fit
         try:
-            located = search.first if number == 0 else _screened(previous, _left(previous, beam), options, generator)
+            own = step.fit.model.terms[-1]
+            located = search.first if number == 0 else _screened_with_line(previous, own, beam, options, generator)
             assert located is not None
-            if located.p_value > options.level:
+            p_value = others if number == 0 else located.p_value
+            if own.effect.by_periodogram:
+                line = lines(_free(previous, base))
+                p_value = 1.0 if line is None else line.p_of(own)
+            if p_value > options.level:
                 break
+            located = replace(located, p_value=p_value)
             step = _final(step, beam, options, last=number == len(chain) - 1)
             located = _as_result(located, step, beam)
             after = _evidence(search, step.fit, options)
@@ -324,10 +345,41 @@ def with_step_of(search: StepwiseSearch, base: ProcessNoiseFit, options: SearchO
     return replace(search, found=tuple(found), evidence=tuple(evidence))
 
 
+def _screened_with_line(
+    fit: FittedModel, own: Term, beam: BeamSearch, options: SearchOptions, generator: torch.Generator
+) -> SearchResult:
+    """Screen the candidates that a model lacks; a periodic effect is added to them without a test."""
+    located = _screened(fit, _left(fit, beam), options, generator)
+    if not own.effect.by_periodogram:
+        return located
+    return replace(located, look=located.look.with_more([own]))
+
+
 def _left(fit: FittedModel, beam: BeamSearch) -> tuple[Term, ...]:
-    """Return the candidates that a model lacks."""
+    """Return the candidates of the screening that a model lacks."""
     before = {term.key for term in fit.model.terms}
-    return tuple(term for term in beam.terms if term.key not in before)
+    return tuple(term for term in beam.terms if term.key not in before and not term.effect.by_periodogram)
+
+
+def _free(fit: FittedModel, base: ProcessNoiseFit) -> FittedModel:
+    """Return a fit in open loop, if that is found."""
+    if fit is base.fit:
+        return _start(base)
+    return fit if fit.open_loop is None else fit.open_loop
+
+
+def _of_line(beam: BeamSearch) -> list[list[Candidate]]:
+    """Return the best model of a periodic effect alone as a chain."""
+    alone = beam.models[()]
+    single = [
+        model
+        for model in beam.models.values()
+        if len(model.fit.model.terms) == 1
+        and model.fit.model.terms[0].effect.by_periodogram
+        and model.value > alone.value
+        and not beam.enlarges(model)
+    ]
+    return [[max(single, key=lambda model: model.value)]] if single else []
 
 
 def _chain(model: Candidate, beam: BeamSearch) -> list[Candidate]:

@@ -25,9 +25,6 @@ from mkc_torch.effects.periodic import OVERSAMPLING, frequencies
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-_ORDERS = tuple(range(1, 10))
-"""Harmonics of a signal's line that an error of the response to it can have: a friction's ninth is an 81st of its power."""
-
 _WRONG_SIGN = 2.0
 """Ratio of the amplitudes of residual and output up to which a delay of any length, or a wrong sign, can be the cause:
 ``|1 - exp(i phi)| <= 2``."""
@@ -88,41 +85,30 @@ class _Spectrum:
         """Return the logarithm of the power over the level around it; minus infinity where a signal can be the cause.
 
         An error of a linear response changes each frequency of the signal by a factor that is smooth in the frequency,
-        so that the residual's line is no higher above its surroundings than the signal's. That of the output itself is
-        no larger than twice the output's amplitude, if the size of the response is right.
+        so that the residual's line is no higher above its surroundings than the signal's. Where the simulated output
+        has a line, an error of it is no larger than twice its amplitude, if the size of the response is right. An error
+        of a nonlinear response has the frequencies of powers and signs of the signal: harmonics, sums and differences.
         """
         excess = power.clamp(min=1e-300).log() - log_level(power, self.frequency)
         of_signals, of_output, output_power = self._of_signals
         repeats = excess <= of_signals.unsqueeze(-1) + _CHANCE
-        responds = (excess <= of_output.unsqueeze(-1) + _CHANCE) & (
-            power <= _WRONG_SIGN**2 * output_power.unsqueeze(-1)
-        )
+        responds = of_output.isfinite().unsqueeze(-1) & (power <= _WRONG_SIGN**2 * output_power.unsqueeze(-1))
         return torch.where(repeats | responds | excess.isnan(), -torch.inf, excess)
 
     @cached_property
     def _of_signals(self) -> tuple[Float[Tensor, " F"], Float[Tensor, " F"], Float[Tensor, " F"]]:
-        """Return the excess of signals, and excess and power of the output, at the frequency and its fractions."""
-        step = float(self.frequency[1] - self.frequency[0])
-        last = round(float(self.frequency[-1]) / step)
-        grid = step * torch.arange(OVERSAMPLING, last + 1, dtype=torch.float64)
-        known = torch.stack([self.own, *self.signals], -1)
-        constant = self.counts.unsqueeze(-1) / self.counts.sum().sqrt()
-        power = powers(self.time, self.counts, constant, known, grid)
-        mean = (self.counts.unsqueeze(-1) * (known - known.mean(0)).square()).sum(0) / len(grid) * OVERSAMPLING
-        level = torch.maximum(log_level(power, grid), (_FLOOR * mean).clamp(min=1e-300).log())
-        above = neighbours(power.clamp(min=1e-300).log() - level.nan_to_num(torch.inf))
-        near = neighbours(power)
-        excess = torch.full((len(self.frequency), known.shape[1]), -torch.inf, dtype=torch.float64)
-        largest = torch.zeros_like(self.frequency)
-        for order in _ORDERS:
-            place = (self.frequency / order / step).round().long() - OVERSAMPLING
-            there = (place >= 0).unsqueeze(-1)
-            place = place.clamp(min=0)
-            excess = torch.where(there, torch.maximum(excess, above[place]), excess)
-            largest = torch.where(there[:, 0], torch.maximum(largest, near[place, 0] / order**2), largest)
-        excess = torch.where(excess > _usual(len(grid) / OVERSAMPLING), excess, -torch.inf)
-        others = excess[:, 1:].amax(-1) if self.signals else torch.full_like(self.frequency, -torch.inf)
-        return others, excess[:, 0], largest
+        """Return the largest excess of signals near each frequency, and excess and power of the simulated output.
+
+        The excess is minus infinity where it is usual for noise.
+        """
+        signals = [other for signal in (self.own, *self.signals) for other in responses(signal)]
+        known = torch.stack([self.own, *self.signals, *signals], -1)
+        power = self.powers(known)
+        mean = (self.counts.unsqueeze(-1) * (known - known.mean(0)).square()).sum(0) / len(power) * OVERSAMPLING
+        level = torch.maximum(log_level(power, self.frequency), (_FLOOR * mean).clamp(min=1e-300).log())
+        excess = neighbours(power.clamp(min=1e-300).log() - level.nan_to_num(torch.inf))
+        excess = torch.where(excess > _usual(len(power) / OVERSAMPLING), excess, -torch.inf)
+        return excess[:, 1:].amax(-1), excess[:, 0], neighbours(power[:, :1])[:, 0]
 
     def nulls(self, place: int) -> list[Float[Tensor, " F"]]:
         """Return the logarithms of the spectra of noise without a line.
@@ -206,6 +192,20 @@ def line_of(
     kinds = [spectrum.nulls(int(excess[k].argmax())) for k, spectrum in enumerate(spectra)]
     p_value = max(_p_value(spectra, null, largest, draws, generator) for null in zip(*kinds, strict=True))
     return Line(frequency, channel, largest, p_value)
+
+
+def responses(signal: Float[Tensor, " N"]) -> tuple[Float[Tensor, " N"], ...]:
+    """Return nonlinear functions of a signal, which have the frequencies that nonlinear responses to it have.
+
+    Square and cube stand for smooth responses, the sign for dead zones and stops, the sign of the rate for friction and
+    backlash.
+
+    Example:
+        >>> [values.tolist() for values in responses(torch.tensor([-1.0, 0.0, 1.0]))]
+        [[1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], [1.0, 1.0, 1.0]]
+    """
+    away = signal - signal.mean()
+    return away.square(), away**3, away.sign(), torch.gradient(away)[0].sign()
 
 
 def _p_value(

@@ -43,6 +43,7 @@ from mkc_torch.effects.dynamics.stribeck_friction import StribeckFriction
 from mkc_torch.effects.dynamics.thermal_loss import ThermalLoss
 from mkc_torch.effects.dynamics.unknown_near_ends import UnknownNearEnds
 from mkc_torch.effects.dynamics.unknown_rate import UnknownRate
+from mkc_torch.effects.periodic import PeriodicOutput, PeriodicRate
 
 __all__ = ["DYNAMICS"]
 
@@ -91,6 +92,8 @@ DYNAMICS: tuple[Effect, ...] = (
     DriverOutputQuadratic(),
     DriverOutputLagged(),
     SensorLag(),
+    PeriodicRate(),
+    PeriodicOutput(),
     UnknownRate("difference"),
     UnknownRate("own"),
     UnknownRate("position"),
