@@ -102,7 +102,7 @@ class Periodic(Effect):
 
 
 class PeriodicOutput(Periodic):
-    """A measured output of differential equations has a sinusoidal part of unknown period: mains hum, a pump's vibration.
+    """A measured output of differential equations has a sinusoidal part of unknown period: mains hum, vibration.
 
     Simulation: adds ``γ₁ cos(2π (t − t₀) / P) + γ₂ sin(2π (t − t₀) / P)`` to one output.
     Drivers: time only.

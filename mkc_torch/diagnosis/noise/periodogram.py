@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from mkc_torch.effects.periodic import FEWEST_CYCLES, OVERSAMPLING
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
 EULER = 0.5772156649
 """Minus the mean of the logarithm of a power whose mean is 1, of an exponential distribution."""
@@ -31,6 +32,12 @@ _CELLS = 4_000_000
 
 _ALIKE = 1e-8
 """Relative determinant of sine and cosine below which the parameters explain them."""
+
+_NODES = 15
+"""Nodes of the quadrature over the error of a level."""
+
+_LARGEST = 300.0
+"""Largest logarithm of an excess, so that its exponential is finite."""
 
 _STEEPEST = 6.0
 """Steepest slope of a spectrum below the lowest frequency, in powers of frequency."""
@@ -90,18 +97,18 @@ def powers(
     return torch.cat(found) if found else series.new_zeros(0, series.shape[1])
 
 
-def without_line(
+def without_lines(
     time: Float[Tensor, " N"],
     counts: Float[Tensor, " N"],
     basis: Float[Tensor, "N k"],
-    series: Float[Tensor, " N"],
-    frequency: float,
-) -> Float[Tensor, " N"]:
-    """Return a series at the samples that count, less the basis and the sinusoid of one frequency."""
-    columns = _sinusoids(time, counts, basis, torch.tensor([frequency], dtype=time.dtype))[0].mT
-    both = torch.linalg.qr(torch.cat([basis, columns], -1))[0]
-    left = counts * series
-    return left - both @ (both.mT @ left)
+    series: Float[Tensor, "N B"],
+    frequency: Float[Tensor, " B"],
+) -> Float[Tensor, "N B"]:
+    """Return series at the samples that count, each less the basis and the sinusoid of a frequency of its own."""
+    left = counts.unsqueeze(-1) * series
+    left = (left - basis @ (basis.mT @ left)).mT
+    columns = torch.linalg.qr(_sinusoids(time, counts, basis, frequency).mT)[0]
+    return (left - (columns @ (columns.mT @ left.unsqueeze(-1))).squeeze(-1)).mT
 
 
 def _sinusoids(time: Tensor, counts: Tensor, basis: Tensor, frequency: Tensor) -> Float[Tensor, "F 2 N"]:
@@ -137,23 +144,58 @@ def log_level(
     Returns:
         The level; NaN where there are too few powers.
     """
-    x, y = frequency.log(), power.clamp(min=1e-300).log()
+    y = power.clamp(min=1e-300).log()
+    index, inside, away = _around(frequency, own=own)
+    n, sx, sxx = inside.sum(-1), away.sum(-1), away.square().sum(-1)
+    weight = inside * (sxx.unsqueeze(-1) - sx.unsqueeze(-1) * away) / (n * sxx - sx.square()).unsqueeze(-1)
+    value = torch.full_like(y, EULER)
+    for k in range(index.shape[1]):
+        value += weight[:, k].unsqueeze(-1) * y[index[:, k]]
+    return torch.where((n >= _FEWEST).unsqueeze(-1), value, torch.nan)
+
+
+def level_error(frequency: Float[Tensor, " F"]) -> Float[Tensor, " F"]:
+    """Return the standard deviation of :func:`log_level` of noise: larger at the ends of the grid.
+
+    The logarithm of a power of noise has a standard deviation of π / √6.
+    """
+    _, inside, away = _around(frequency, own=False)
+    n, sx, sxx = inside.sum(-1), away.sum(-1), away.square().sum(-1)
+    return math.pi / math.sqrt(6.0) * (sxx / (n * sxx - sx.square())).sqrt()
+
+
+def _around(
+    frequency: Float[Tensor, " F"], *, own: bool
+) -> tuple[Int[Tensor, "F k"], Float[Tensor, "F k"], Float[Tensor, "F k"]]:
+    """Return independent frequencies around each: their numbers, 1 within the grid, and distances of the logarithms."""
     nearest = 0 if own else _OWN
     offsets = [OVERSAMPLING * k for k in range(-REACH, REACH + 1) if abs(k) >= nearest]
-    F = len(frequency)
-    index = torch.arange(F).unsqueeze(-1) + torch.tensor(offsets)
-    inside = ((index >= 0) & (index < F)).to(x)
-    index = index.clamp(0, F - 1)
-    away = (x[index] - x.unsqueeze(-1)) * inside
-    n, sx, sxx = inside.sum(-1), away.sum(-1), away.square().sum(-1)
-    sy, sxy = torch.zeros_like(y), torch.zeros_like(y)
-    for k in range(len(offsets)):
-        here = inside[:, k].unsqueeze(-1) * y[index[:, k]]
-        sy += here
-        sxy += away[:, k].unsqueeze(-1) * here
-    det = n * sxx - sx.square()
-    value = (sxx.unsqueeze(-1) * sy - sx.unsqueeze(-1) * sxy) / det.clamp(min=1e-300).unsqueeze(-1)
-    return torch.where((n >= _FEWEST).unsqueeze(-1), value + EULER, torch.nan)
+    index = torch.arange(len(frequency)).unsqueeze(-1) + torch.tensor(offsets)
+    inside = ((index >= 0) & (index < len(frequency))).to(frequency)
+    index = index.clamp(0, len(frequency) - 1)
+    x = frequency.log()
+    return index, inside, (x[index] - x.unsqueeze(-1)) * inside
+
+
+def evidence(excess: Float[Tensor, "F B"], error: Float[Tensor, " F"]) -> Float[Tensor, "F B"]:
+    """Return minus the logarithm of the probability that noise has as large an excess over its level.
+
+    A power of noise has an exponential distribution around its level, whose logarithm is known with a normal error.
+
+    Args:
+        excess: logarithm of the power over the level.
+        error: standard deviation of the level's logarithm.
+
+    Example:
+        >>> evidence(torch.tensor([[3.0]]).double().log(), torch.tensor([0.0]).double()).round(decimals=3)
+        tensor([[3.]], dtype=torch.float64)
+    """
+    at, weight = (torch.from_numpy(values) for values in np.polynomial.hermite_e.hermegauss(_NODES))
+    logs = (weight / weight.sum()).log()
+    total = torch.full_like(excess, -torch.inf)
+    for node, share in zip(at, logs, strict=True):
+        total = torch.logaddexp(total, share - (excess + error.unsqueeze(-1) * node).clamp(max=_LARGEST).exp())
+    return -total
 
 
 def drawn_noise(
@@ -192,7 +234,7 @@ def drawn_noise(
     return total
 
 
-def neighbours(values: Float[Tensor, "F *B"], resolutions: int = 1) -> Float[Tensor, "F *B"]:
+def neighbours(values: Float[Tensor, F * B], resolutions: int = 1) -> Float[Tensor, F * B]:
     """Return the largest value within some resolutions of each frequency."""
     reach = OVERSAMPLING * resolutions
     padded = torch.nn.functional.pad(values.mT, (reach, reach), value=-torch.inf)

@@ -64,7 +64,9 @@ def line_candidates(
         options: of the diagnosis.
     """
     prepared = fit.model.prepared
-    places = [(effect, port) for effect in effects if effect.by_periodogram for port in ports_of(effect, prepared.ports)]
+    places = [
+        (effect, port) for effect in effects if effect.by_periodogram for port in ports_of(effect, prepared.ports)
+    ]
     if not places or options.too_few:
         return None
     values, counts = fit.pseudo(options.settings.noise)
@@ -82,13 +84,13 @@ def line_candidates(
         return None
     shape = {"period": 1.0 / line.frequency, "start": float(prepared.time.min())}
     channel = prepared.channels[line.channel]
-    known = {term.key for term in fit.model.terms}
+    have = {term.key for term in fit.model.terms}
     terms = [Term(effect, None, shape, "" if port == effect.port else port) for effect, port in places]
     # an output without a state has the line itself; a state's disturbance can show in any output
     terms = [
         term
         for term in terms
-        if term.key not in known and (prepared.dynamics is not None or channel in prepared.ports[term.port].channels)
+        if term.key not in have and (prepared.dynamics is not None or channel in prepared.ports[term.port].channels)
     ]
     resolution = 1.0 / float(prepared.time.max() - prepared.time.min())
     return PeriodicCandidates(tuple(terms), line.p_value, resolution) if terms else None
@@ -172,9 +174,7 @@ def line_step(search: StepwiseSearch, fit: FittedModel, lines: Lines, options: S
     return taken if search.found else replace(taken, first=located)
 
 
-def _located(
-    fit: FittedModel, line: PeriodicCandidates, terms: Sequence[Term], options: SearchOptions
-) -> SearchResult:
+def _located(fit: FittedModel, line: PeriodicCandidates, terms: Sequence[Term], options: SearchOptions) -> SearchResult:
     """Return the search result of a line, its rivals behind it by their linear gains."""
     settings = options.settings
     both = (*terms, line.terms[0])

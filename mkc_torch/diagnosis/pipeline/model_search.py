@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -25,30 +24,31 @@ from mkc_torch.diagnosis.model.process_noise import (
 from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time
-from mkc_torch.diagnosis.pipeline.lines import Lines, with_line
+from mkc_torch.diagnosis.pipeline.chains import (
+    chain_of_line,
+    chain_to,
+    chains_to_test,
+    other_ways,
+    without_replaced_curves,
+)
+from mkc_torch.diagnosis.pipeline.lines import Lines, PeriodicCandidates, with_line
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.pipeline.suspected import suspected_models
 from mkc_torch.diagnosis.pipeline.trail import trail_of
 from mkc_torch.diagnosis.score import basis_of, score, separation
 from mkc_torch.diagnosis.search.beam import BeamSearch
-from mkc_torch.diagnosis.search.candidate import Candidate, in_order
+from mkc_torch.diagnosis.search.candidate import Candidate
 from mkc_torch.diagnosis.search.columns import best_change
 from mkc_torch.diagnosis.search.moves import comes_by_exchange
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.search.screening import screened
-from mkc_torch.diagnosis.thresholds import FAR_LESS, KEPT, NAMED
+from mkc_torch.diagnosis.thresholds import FAR_LESS, KEPT
 from mkc_torch.nonlinear import NoFitError
 
 Keep = Callable[[StepwiseSearch], object]
 """A callback that receives the search so far, in case it is stopped."""
-
-_NEXT = 3
-"""Models that are asked in turn if held-out blocks refuse the only effect of the best."""
-
-_SAME_SCORE = 0.1
-"""Nats within which the scores of two fits of the same physics are equal."""
 
 _QUICK_MODELS = 8
 """Largest number of models in a quick look."""
@@ -106,14 +106,17 @@ def search_models(
     if first.p_value > options.level:
         follow = _follow(beam) if not options.quick else ()
         return replace(search, left=(), first=replace(first, follow=follow))
+    p_values = _PValues(others, line, lines)
     tested = partial(
-        _tested, search, others=others, lines=lines, beam=beam, base=base, options=options, generator=generator, keep=keep
+        _tested, search, p_values=p_values, beam=beam, base=base, options=options, generator=generator, keep=keep
     )
-    for chain in [*_in_turn(beam), *_of_line(beam)]:
+    for chain in [*chains_to_test(beam), *chain_of_line(beam)]:
+        if others > options.level and not chain[0].fit.model.terms[0].effect.by_periodogram:
+            continue
         found = _in_either_way(chain, beam, tested)
         # the simpler model counts as a rival only if all its effects are significant
         if 0 < len(found.found) < len(chain) and beam.best.key != chain[-1].key:
-            again = _in_either_way(_chain(beam.best, beam), beam, tested)
+            again = _in_either_way(chain_to(beam.best, beam), beam, tested)
             found = again if len(again.found) > len(found.found) else found
         if found.found or not found.unconfirmed:
             return found
@@ -126,7 +129,7 @@ def _in_either_way(
 ) -> StepwiseSearch:
     """Test a chain of models, and if an effect is not significant another chain; return the longer result."""
     found = tested(chain)
-    for other in _other_ways(chain, len(found.found), beam):
+    for other in other_ways(chain, len(found.found), beam):
         again = tested(other)
         found = again if len(again.found) > len(found.found) else found
     return found
@@ -198,91 +201,33 @@ def _goodness(fit: FittedModel) -> tuple[GoodnessOfFit, ...]:
     return goodness_of_fit(fit.model.prepared, fit.residual, {}, None)
 
 
-def _in_turn(beam: BeamSearch) -> list[list[Candidate]]:
-    """Return chains of models to test: that of the simplest good model, and models with one effect.
+@dataclass(frozen=True)
+class _PValues:
+    """The p-values of effects: of a periodic effect that of the line, of all others that of the screening.
 
-    The simplest good model has the lowest price of those that this recording cannot separate from the highest score,
-    and each of its effects raises the score: effects that only gain together have no null in which the first is missing
-    alone. The screening has shown that an effect is missing, so the simulation alone is no rival of models with one
-    effect: those that are more likely are tested if the first chain is refused.
-    """
-    alone = beam.models[()]
-    least = -math.inf if alone.score is None else alone.score.log_likelihood
-    usable = [
-        model
-        for model in beam.models.values()
-        if model.fit.model.terms
-        and model.score is not None
-        and model.score.log_likelihood > least
-        and not beam.enlarges(model)
-    ]
-    ranked = sorted(_named(usable, alone), key=lambda model: -model.value)
-    single = [[model] for model in ranked if len(model.fit.model.terms) == 1]
-    good = [model for model in ranked if model.value > alone.value]
-    behind = beam.settings.naming.separable * beam.basis.kappa
-    alike = [model for model in good if model.value >= good[0].value - behind]
-    for model in [*_by_price(alike, beam.terms), *good[len(alike) :]]:
-        chain = _chain(model, beam)
-        if all(later.value > earlier.value for earlier, later in itertools.pairwise([alone, *chain])):
-            return [chain, *[other for other in single if other[0].key != chain[0].key]][:_NEXT]
-    return single[:_NEXT]
-
-
-def _by_price(models: Sequence[Candidate], terms: Sequence[Term]) -> list[Candidate]:
-    """Order models by price, at equal price first those to first order in their columns, then by score.
-
-    The same dependence on a column can have two names, as a loss and as the parameter of this loss. Of models of equal
-    price and score with the same columns, the name that is first in the catalogue comes first.
+    Attributes:
+        others: of the screening at the simulation alone.
+        line: at the simulation alone; None without a line.
+        lines: the search for the line of another fit.
     """
 
-    def price(model: Candidate) -> tuple[float, int]:
-        return round(model.price, 6), sum(comes_by_exchange(term) for term in model.fit.model.terms)
+    others: float
+    line: PeriodicCandidates | None
+    lines: Lines
 
-    def columns(model: Candidate) -> list[tuple[str, ...]]:
-        return sorted(term.columns for term in model.fit.model.terms)
-
-    def place(model: Candidate) -> list[int]:
-        own = {term.key for term in model.fit.model.terms}
-        return sorted(number for number, term in enumerate(terms) if term.key in own)
-
-    ordered = sorted(models, key=price)
-    for number, model in enumerate(ordered):
-        same = [
-            other
-            for other in ordered[number:]
-            if price(other) == price(model) and columns(other) == columns(model) and any(columns(model))
-            if abs(other.value - model.value) < _SAME_SCORE
-        ]
-        if same:
-            first = min(same, key=place)
-            ordered.remove(first)
-            ordered.insert(number, first)
-    return ordered
-
-
-def _named(models: Sequence[Candidate], alone: Candidate) -> list[Candidate]:
-    """Return the models, without those whose curve follows hardly better than a model of named effects.
-
-    A curve can follow any physics; it is the answer where no effect of the catalogue comes near.
-    """
-    curves = {model.key: any(term.effect.is_curve for term in model.fit.model.terms) for model in models}
-    named = [model for model in models if not curves[model.key] and model.value > alone.value]
-
-    def replaced(model: Candidate) -> bool:
-        return any(
-            len(other.fit.model.terms) <= len(model.fit.model.terms)
-            and other.log_typical_size <= model.log_typical_size + math.log(NAMED)
-            for other in named
-        )
-
-    return [model for model in models if not (curves[model.key] and replaced(model))]
+    def of(self, own: Term, previous: FittedModel, located: SearchResult, number: int) -> float:
+        """Return the p-value of an effect, the ``number``-th after the simulation alone, at the fit before it."""
+        if not own.effect.by_periodogram:
+            return located.p_value if number else self.others
+        free = previous if previous.open_loop is None else previous.open_loop
+        line = self.lines(free) if number else self.line
+        return 1.0 if line is None else line.p_of(own)
 
 
 def _tested(
     search: StepwiseSearch,
     chain: Sequence[Candidate],
-    others: float,
-    lines: Lines,
+    p_values: _PValues,
     beam: BeamSearch,
     base: ProcessNoiseFit,
     options: SearchOptions,
@@ -291,8 +236,7 @@ def _tested(
 ) -> StepwiseSearch:
     """Add the effects of a chain of models one after the other as long as each is significant.
 
-    The null of each is the model with the effects before it, and all candidates are screened again. A periodic effect
-    has the p-value of the line, all other effects that of the screening; ``others`` is that of the first.
+    The null of each is the model with the effects before it, and all candidates are screened again.
     """
     for number, step in enumerate(chain):
         previous = search.found[-1].fit if search.found else base.fit
@@ -300,13 +244,9 @@ def _tested(
             own = step.fit.model.terms[-1]
             located = search.first if number == 0 else _screened_with_line(previous, own, beam, options, generator)
             assert located is not None
-            p_value = others if number == 0 else located.p_value
-            if own.effect.by_periodogram:
-                line = lines(_free(previous, base))
-                p_value = 1.0 if line is None else line.p_of(own)
-            if p_value > options.level:
+            located = replace(located, p_value=p_values.of(own, previous, located, number))
+            if located.p_value > options.level:
                 break
-            located = replace(located, p_value=p_value)
             step = _final(step, beam, options, last=number == len(chain) - 1)
             located = _as_result(located, step, beam)
             after = _evidence(search, step.fit, options)
@@ -361,66 +301,6 @@ def _left(fit: FittedModel, beam: BeamSearch) -> tuple[Term, ...]:
     return tuple(term for term in beam.terms if term.key not in before and not term.effect.by_periodogram)
 
 
-def _free(fit: FittedModel, base: ProcessNoiseFit) -> FittedModel:
-    """Return a fit in open loop, if that is found."""
-    if fit is base.fit:
-        return _start(base)
-    return fit if fit.open_loop is None else fit.open_loop
-
-
-def _of_line(beam: BeamSearch) -> list[list[Candidate]]:
-    """Return the best model of a periodic effect alone as a chain."""
-    alone = beam.models[()]
-    single = [
-        model
-        for model in beam.models.values()
-        if len(model.fit.model.terms) == 1
-        and model.fit.model.terms[0].effect.by_periodogram
-        and model.value > alone.value
-        and not beam.enlarges(model)
-    ]
-    return [[max(single, key=lambda model: model.value)]] if single else []
-
-
-def _chain(model: Candidate, beam: BeamSearch) -> list[Candidate]:
-    """Return models with 1, 2, … of a model's effects: the effect whose loss costs least score is the last."""
-    chain = [model]
-    while len(chain[0].fit.model.terms) > 1:
-        less = beam.with_one_less(chain[0])
-        if not less:
-            break
-        chain.insert(0, max(less, key=lambda candidate: candidate.value))
-    return _in_orders_of(chain)
-
-
-def _in_orders_of(chain: Sequence[Candidate]) -> list[Candidate]:
-    """Return a chain with the effects of each model in the order in which they enter."""
-    ordered = [chain[0]]
-    for model in chain[1:]:
-        before = ordered[-1]
-        ordered.append(in_order(model, [*before.fit.model.terms, *_missing(model, before)]))
-    return ordered
-
-
-def _other_ways(chain: Sequence[Candidate], reached: int, beam: BeamSearch) -> list[list[Candidate]]:
-    """Return chains that end a step behind the effects that were found, and reach it through other effects.
-
-    A linear screening may not see an effect while another is missing: a second vessel that fills only once the first
-    overflows.
-    """
-    if not 0 < reached < len(chain):
-        return []
-    last = {term.key for term in _missing(chain[reached], chain[reached - 1])}
-    ways = [less for less in beam.with_one_less(chain[reached]) if last & {term.key for term in less.fit.model.terms}]
-    ways.sort(key=lambda model: -model.value)
-    return [_in_orders_of([*_chain(way, beam), chain[reached]]) for way in ways[:1]]
-
-
-def _missing(model: Candidate, smaller: Candidate) -> list[Term]:
-    known = {term.key for term in smaller.fit.model.terms}
-    return [term for term in model.fit.model.terms if term.key not in known]
-
-
 def _final(step: Candidate, beam: BeamSearch, options: SearchOptions, *, last: bool) -> Candidate:
     """Return a model at its best shape, noise and, of the last, holds of the inputs, each by its score."""
     if options.quick:
@@ -443,7 +323,7 @@ def _as_result(located: SearchResult, step: Candidate, beam: BeamSearch) -> Sear
     terms = located.scene.terms
     others = {term.key for term in fit.model.terms[:-1]}
     rivals: dict[Key, Candidate] = {}
-    for model in _named(list(beam.models.values()), beam.models[()]):
+    for model in without_replaced_curves(list(beam.models.values()), beam.models[()]):
         more = [term.key for term in model.fit.model.terms if term.key not in others]
         if len(model.fit.model.terms) == len(others) + 1 and len(more) == 1:
             known = rivals.get(more[0])

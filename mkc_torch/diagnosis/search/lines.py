@@ -14,16 +14,18 @@ from torch import Tensor
 from mkc_torch.diagnosis.noise.periodogram import (
     REACH,
     drawn_noise,
+    evidence,
+    level_error,
     log_level,
     neighbours,
     powers,
     slow_basis,
-    without_line,
+    without_lines,
 )
 from mkc_torch.effects.periodic import OVERSAMPLING, frequencies
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Float
 
 _WRONG_SIGN = 2.0
 """Ratio of the amplitudes of residual and output up to which a delay of any length, or a wrong sign, can be the cause:
@@ -53,13 +55,13 @@ class Line:
     Attributes:
         frequency: in Hz.
         channel: number of the residual's channel.
-        excess: logarithm of its power over the level of the noise around it.
-        p_value: of the largest excess at any frequency and in any channel.
+        evidence: minus the logarithm of the probability of its power in noise of the level around it, in nats.
+        p_value: of the largest evidence at any frequency and in any channel.
     """
 
     frequency: float
     channel: int
-    excess: float
+    evidence: float
     p_value: float
 
 
@@ -71,6 +73,7 @@ class _Spectrum:
     counts: Float[Tensor, " N"]
     basis: Float[Tensor, "N k"]
     series: Float[Tensor, " N"]
+    slow: Float[Tensor, "N s"]
     own: Float[Tensor, " N"]
     signals: tuple[Float[Tensor, " N"], ...]
 
@@ -81,8 +84,8 @@ class _Spectrum:
     def powers(self, series: Float[Tensor, "N B"]) -> Float[Tensor, "F B"]:
         return powers(self.time, self.counts, self.basis, series, self.frequency)
 
-    def excess(self, power: Float[Tensor, "F B"]) -> Float[Tensor, "F B"]:
-        """Return the logarithm of the power over the level around it; minus infinity where a signal can be the cause.
+    def evidence(self, power: Float[Tensor, "F B"]) -> Float[Tensor, "F B"]:
+        """Return the evidence for a line at each frequency in nats; minus infinity where a signal can be the cause.
 
         An error of a linear response changes each frequency of the signal by a factor that is smooth in the frequency,
         so that the residual's line is no higher above its surroundings than the signal's. Where the simulated output
@@ -93,7 +96,21 @@ class _Spectrum:
         of_signals, of_output, output_power = self._of_signals
         repeats = excess <= of_signals.unsqueeze(-1) + _CHANCE
         responds = of_output.isfinite().unsqueeze(-1) & (power <= _WRONG_SIGN**2 * output_power.unsqueeze(-1))
-        return torch.where(repeats | responds | excess.isnan(), -torch.inf, excess)
+        found = evidence(excess, level_error(self.frequency))
+        return torch.where(repeats | responds | excess.isnan(), -torch.inf, found)
+
+    def strongest(self, series: Float[Tensor, "N B"]) -> tuple[Float[Tensor, " B"], Int[Tensor, " B"]]:
+        """Return the evidence for each series' strongest line, and its frequency's number.
+
+        The level around the strongest is that of the series without it: its side lobes would raise the level.
+        """
+        power = self.powers(series)
+        found, place = self.evidence(power).max(0)
+        left = without_lines(self.time, self.counts, self.basis, series, self.frequency[place])
+        level = log_level(self.powers(left), self.frequency).gather(0, place.unsqueeze(0))[0]
+        excess = power.gather(0, place.unsqueeze(0))[0].clamp(min=1e-300).log() - level
+        again = evidence(excess.unsqueeze(-1), level_error(self.frequency)[place])[:, 0]
+        return torch.where(found.isfinite(), again, found), place
 
     @cached_property
     def _of_signals(self) -> tuple[Float[Tensor, " F"], Float[Tensor, " F"], Float[Tensor, " F"]]:
@@ -103,11 +120,12 @@ class _Spectrum:
         """
         signals = [other for signal in (self.own, *self.signals) for other in responses(signal)]
         known = torch.stack([self.own, *self.signals, *signals], -1)
-        power = self.powers(known)
+        # the parameters' tangents can span the outputs themselves
+        power = powers(self.time, self.counts, self.slow, known, self.frequency)
         mean = (self.counts.unsqueeze(-1) * (known - known.mean(0)).square()).sum(0) / len(power) * OVERSAMPLING
         level = torch.maximum(log_level(power, self.frequency), (_FLOOR * mean).clamp(min=1e-300).log())
         excess = neighbours(power.clamp(min=1e-300).log() - level.nan_to_num(torch.inf))
-        excess = torch.where(excess > _usual(len(power) / OVERSAMPLING), excess, -torch.inf)
+        excess = torch.where(excess > _usual(power.numel() / OVERSAMPLING), excess, -torch.inf)
         return excess[:, 1:].amax(-1), excess[:, 0], neighbours(power[:, :1])[:, 0]
 
     def nulls(self, place: int) -> list[Float[Tensor, " F"]]:
@@ -119,8 +137,8 @@ class _Spectrum:
         plain = log_level(self.powers(self.series.unsqueeze(-1)), self.frequency, own=True)
         frequency = self.zoomed(place)
         known = self.time, self.counts, self.basis, self.series.unsqueeze(-1)
-        left = without_line(self.time, self.counts, self.basis, self.series, frequency)
-        power = self.powers(left.unsqueeze(-1))
+        left = without_lines(*known, torch.tensor([frequency], dtype=torch.float64))
+        power = self.powers(left)
         rest = log_level(power, self.frequency, own=True)
         line = float(powers(*known, torch.tensor([frequency], dtype=torch.float64)))
         resonance = _resonance(power[:, 0], rest[:, 0], self.frequency, frequency, line)
@@ -147,7 +165,7 @@ def line_of(
     draws: int,
     generator: torch.Generator,
 ) -> Line | None:
-    """Return the line of a residual that is highest above the noise around it; None without a possible line.
+    """Return the line of a residual with the most evidence against the noise around it; None without a possible line.
 
     The maximum over all frequencies and channels is compared with the same maximum of noise without a line. A
     frequency at which a signal has a line itself is left out: an error of the simulation's response to it looks alike.
@@ -173,23 +191,22 @@ def line_of(
             counts[:, k],
             slow_basis(time, counts[:, k], tangents[:, k]),
             counts[:, k] * values[:, k],
+            slow_basis(time, counts[:, k], tangents[:, k, :0]),
             outputs[:, k],
             tuple(signals),
         )
         for k in range(values.shape[1])
     ]
-    excess = torch.stack([spectrum.excess(spectrum.powers(spectrum.series.unsqueeze(-1)))[:, 0] for spectrum in spectra])
-    number = int(excess.argmax())
-    channel, place = divmod(number, excess.shape[1])
-    largest = float(excess[channel, place])
+    found = [spectrum.strongest(spectrum.series.unsqueeze(-1)) for spectrum in spectra]
+    channel = max(range(len(found)), key=lambda k: float(found[k][0]))
+    largest, place = float(found[channel][0]), int(found[channel][1])
     if not math.isfinite(largest):
         return None
     frequency = spectra[channel].zoomed(place)
-    independent = excess.numel() / OVERSAMPLING
-    expected = independent * math.exp(-math.exp(min(largest, 50.0)))
+    expected = sum(len(spectrum.frequency) for spectrum in spectra) / OVERSAMPLING * math.exp(-largest)
     if expected > math.log(2.0) or not draws:
         return Line(frequency, channel, largest, min(expected, 1.0) if not draws else 1.0)
-    kinds = [spectrum.nulls(int(excess[k].argmax())) for k, spectrum in enumerate(spectra)]
+    kinds = [spectrum.nulls(int(found[k][1])) for k, spectrum in enumerate(spectra)]
     p_value = max(_p_value(spectra, null, largest, draws, generator) for null in zip(*kinds, strict=True))
     return Line(frequency, channel, largest, p_value)
 
@@ -215,7 +232,7 @@ def _p_value(
     draws: int,
     generator: torch.Generator,
 ) -> float:
-    """Return the share of draws whose largest excess over frequencies and channels is as large."""
+    """Return the share of draws whose largest evidence over frequencies and channels is as large."""
     as_large = total = 0
     for count in (min(_FIRST_DRAWS, draws), draws - min(_FIRST_DRAWS, draws)):
         if not count:
@@ -224,7 +241,7 @@ def _p_value(
         for spectrum, log_power in zip(spectra, null, strict=True):
             noise = drawn_noise(spectrum.time, log_power, spectrum.frequency, count, generator)
             scale = spectrum.series.square().sum() / (spectrum.counts.unsqueeze(-1) * noise).square().sum(0)
-            found.append(spectrum.excess(spectrum.powers(scale.sqrt() * noise)).amax(0))
+            found.append(spectrum.strongest(scale.sqrt() * noise)[0])
         as_large += int((torch.stack(found).amax(0) >= largest).sum())
         total += count
         if as_large > 0.2 * total:
