@@ -19,6 +19,7 @@ from mkc_torch.diagnosis.noise.periodogram import (
     log_level,
     neighbours,
     powers,
+    quiet_level,
     slow_basis,
     without_lines,
 )
@@ -34,6 +35,9 @@ _WRONG_SIGN = 2.0
 _CHANCE = math.log(3.0)
 """Logarithm of the ratio by which a line's excess in the residual has to exceed that in a signal: the level of each is
 known to a quarter of its size, and three standard errors of both together are a factor of 3."""
+
+_FALSE = 0.05
+"""Expected number of lines of noise among the lines of all signals."""
 
 _FLOOR = 1e-4
 """Level of a noise-free signal, over its mean power: lines below a millionth of its variance are rounding."""
@@ -114,18 +118,19 @@ class _Spectrum:
 
     @cached_property
     def _of_signals(self) -> tuple[Float[Tensor, " F"], Float[Tensor, " F"], Float[Tensor, " F"]]:
-        """Return the largest excess of signals near each frequency, and excess and power of the simulated output.
+        """Return the excess of signals' lines near each frequency, and excess and power of the output's.
 
-        The excess is minus infinity where it is usual for noise.
+        The excess is minus infinity where there is no line.
         """
         signals = [other for signal in (self.own, *self.signals) for other in responses(signal)]
         known = torch.stack([self.own, *self.signals, *signals], -1)
         # the parameters' tangents can span the outputs themselves
         power = powers(self.time, self.counts, self.slow, known, self.frequency)
         mean = (self.counts.unsqueeze(-1) * (known - known.mean(0)).square()).sum(0) / len(power) * OVERSAMPLING
-        level = torch.maximum(log_level(power, self.frequency), (_FLOOR * mean).clamp(min=1e-300).log())
-        excess = neighbours(power.clamp(min=1e-300).log() - level.nan_to_num(torch.inf))
-        excess = torch.where(excess > _usual(power.numel() / OVERSAMPLING), excess, -torch.inf)
+        level = torch.maximum(quiet_level(power, self.frequency), (_FLOOR * mean).clamp(min=1e-300).log())
+        excess = neighbours(power.clamp(min=1e-300).log() - level)
+        least = math.log(math.log(power.numel() / OVERSAMPLING / _FALSE))
+        excess = torch.where(excess > least, excess, -torch.inf)
         return excess[:, 1:].amax(-1), excess[:, 0], neighbours(power[:, :1])[:, 0]
 
     def nulls(self, place: int) -> list[Float[Tensor, " F"]]:
@@ -181,7 +186,8 @@ def line_of(
         generator: of the draws.
 
     Returns:
-        The line, with a p-value of 1 where it is as high as the usual maximum of noise.
+        The line. Its p-value is the largest of those of two kinds of noise and of independent frequencies in noise of
+        a known level; the latter alone where it is above a half.
     """
     if bool((time.diff() < 0.0).any()) or len(frequencies(time)) < OVERSAMPLING * REACH:
         return None
@@ -205,10 +211,10 @@ def line_of(
     frequency = spectra[channel].zoomed(place)
     expected = sum(len(spectrum.frequency) for spectrum in spectra) / OVERSAMPLING * math.exp(-largest)
     if expected > math.log(2.0) or not draws:
-        return Line(frequency, channel, largest, min(expected, 1.0) if not draws else 1.0)
+        return Line(frequency, channel, largest, min(expected, 1.0))
     kinds = [spectrum.nulls(int(found[k][1])) for k, spectrum in enumerate(spectra)]
-    p_value = max(_p_value(spectra, null, largest, draws, generator) for null in zip(*kinds, strict=True))
-    return Line(frequency, channel, largest, p_value)
+    p_values = [_p_value(spectra, null, largest, draws, generator) for null in zip(*kinds, strict=True)]
+    return Line(frequency, channel, largest, max(expected, *p_values))
 
 
 def responses(signal: Float[Tensor, " N"]) -> tuple[Float[Tensor, " N"], ...]:
@@ -296,8 +302,3 @@ def _resonance(
     if not float(value[best]) > plain:
         return torch.zeros_like(frequency)
     return shape(frequency)[best]
-
-
-def _usual(independent: float) -> float:
-    """Return the logarithm of the largest of independent powers of noise that one in twenty exceeds."""
-    return math.log(math.log(20.0 * independent))
