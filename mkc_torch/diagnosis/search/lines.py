@@ -296,6 +296,8 @@ def _resonance(
     scale = ratio.mean(-1, keepdim=True)
     at_line = own * scale[:, 0] * shape(torch.tensor([center], dtype=torch.float64))[:, 0].exp()
     value = -(mean.log() + scale.log() + ratio / scale).sum(-1) - at_line.log() - line / at_line
+    # the line is the largest of the independent powers within the resonance
+    value += (math.pi * width / step).clamp(min=1.0).log()
     alone = (there / base).mean()
     plain = -float((base.log() + alone.log() + there / base / alone).sum()) - math.log(line) - 1.0
     best = int(value.argmax())

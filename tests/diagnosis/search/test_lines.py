@@ -35,7 +35,7 @@ def is_significant(line):
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize(("colour", "size"), [("white", 0.8), ("autoregressive", 2.5), ("walk", 3.0)])
+@pytest.mark.parametrize(("colour", "size"), [("white", 0.8), ("autoregressive", 4.0), ("walk", 5.0)])
 def test_a_line_is_found_in_noise_of_each_colour(seed, colour, size):
     r = np.random.default_rng(seed)
     white = r.normal(size=600)
