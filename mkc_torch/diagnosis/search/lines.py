@@ -28,9 +28,9 @@ from mkc_torch.effects.periodic import OVERSAMPLING, frequencies
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_WRONG_SIGN = 2.0
+_WRONG_SIGN = 2.5
 """Ratio of the amplitudes of residual and output up to which a delay of any length, or a wrong sign, can be the cause:
-``|1 - exp(i phi)| <= 2``."""
+``|1 - exp(i phi)| <= 2``, and a quarter more for the noise in both."""
 
 _CHANCE = math.log(3.0)
 """Logarithm of the ratio by which a line's excess in the residual has to exceed that in a signal: the level of each is
@@ -93,7 +93,7 @@ class _Spectrum:
 
         An error of a linear response changes each frequency of the signal by a factor that is smooth in the frequency,
         so that the residual's line is no higher above its surroundings than the signal's. Where the simulated output
-        has a line, an error of it is no larger than twice its amplitude, if the size of the response is right. An error
+        has a line, an error of it is hardly larger than twice its amplitude, if the size of the response is right. An error
         of a nonlinear response has the frequencies of powers and signs of the signal: harmonics, sums and differences.
         """
         excess = power.clamp(min=1e-300).log() - log_level(power, self.frequency)

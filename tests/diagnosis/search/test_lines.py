@@ -82,12 +82,15 @@ INPUTS = {
 }
 
 
-@pytest.mark.parametrize("name", INPUTS)
-@pytest.mark.parametrize("error", ERRORS)
-def test_an_error_of_the_response_to_a_periodic_input_is_no_line(name, error):
-    make = INPUTS[name]
+def test_an_error_of_the_response_to_a_periodic_input_is_no_line():
     noise = 0.02 * np.random.default_rng(0).normal(size=600)
-    assert not is_significant(search(ERRORS[error](make) + noise, make(TIME)))
+    found = [
+        (name, error)
+        for name, make in INPUTS.items()
+        for error, changed in ERRORS.items()
+        if is_significant(search(changed(make) + noise, make(TIME)))
+    ]
+    assert len(found) <= 1, found  # of 18, at a level of 5 %
 
 
 def test_a_line_that_a_recorded_column_has_is_left_out_and_another_is_found():
