@@ -93,8 +93,9 @@ class _Spectrum:
 
         An error of a linear response changes each frequency of the signal by a factor that is smooth in the frequency,
         so that the residual's line is no higher above its surroundings than the signal's. Where the simulated output
-        has a line, an error of it is hardly larger than twice its amplitude, if the size of the response is right. An error
-        of a nonlinear response has the frequencies of powers and signs of the signal: harmonics, sums and differences.
+        has a line, an error of it is hardly larger than twice its amplitude, if the size of the response is right. An
+        error of a nonlinear response has the frequencies of powers and signs of the signal: harmonics, sums and
+        differences.
         """
         excess = power.clamp(min=1e-300).log() - log_level(power, self.frequency)
         of_signals, of_output, output_power = self._of_signals
