@@ -26,7 +26,7 @@ from mkc_torch.diagnosis.noise.periodogram import (
 from mkc_torch.effects.periodic import OVERSAMPLING, frequencies
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
 _WRONG_SIGN = 2.5
 """Ratio of the amplitudes of residual and output up to which a delay of any length, or a wrong sign, can be the cause:
