@@ -73,7 +73,8 @@ class Effect(ABC):
         is_generalisation: whether named effects, such as drags or an added mass, are special cases of it; they are
             preferred where they fit as well. Default False.
         unrecorded: whether it is a waveform in time whose cause is in no column; default False.
-            Default False.
+        by_periodogram: whether its shape is found by a periodogram of the residual, and not by the grid of candidates;
+            default False.
         remembers: whether its change at a moment depends on the signal at other moments; such effects act first where
             several are in series on an input or an output. Default False.
         settles: parameters of the clocks, "offset" or "rate", that it is equivalent to where it acts on all outputs;
@@ -149,6 +150,7 @@ class Effect(ABC):
     is_curve: bool = False
     is_generalisation: bool = False
     unrecorded: bool = False
+    by_periodogram: bool = False
     remembers: bool = False
     settles: tuple[str, ...] = ()
     mistaken_for: Effect | None = None

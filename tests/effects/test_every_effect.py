@@ -102,7 +102,7 @@ def test_ids_are_unchanged():
     assert tuple(effect.id for effect in PAIRED) == (
         "gain", "offset", "delay", "clock_drift", "backlash", "output_saturation", "gravity_sag", "offset", "delay",
         "backlash", "gravity_sag", "driver_linear", "driver_quadratic", "driver_gain", "gain_drift", "driver_friction",
-        "driver_bouc_wen", "driver_dahl", "driver_pair",
+        "driver_bouc_wen", "driver_dahl", "driver_pair", "periodic",
     )  # fmt: skip
     assert {effect.id for effect in DYNAMICS} >= {
         "constant_force", "linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction",
@@ -111,7 +111,7 @@ def test_ids_are_unchanged():
         "added_mass", "magnus_lift", "buoyancy", "hidden_lag", "hidden_mode", "power_law", "input_lag", "input_square",
         "driver_force", "driver_exchange", "driver_rate_constant", "driver_input_gain",
         "driver_parameter", "driver_parameter_quadratic", "driver_parameter_arrhenius",
-        "driver_output", "driver_output_quadratic", "driver_output_lagged",
+        "driver_output", "driver_output_quadratic", "driver_output_lagged", "periodic_rate", "periodic_output",
     }  # fmt: skip
     assert (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED) == CATALOGUE
     several = (
@@ -128,7 +128,8 @@ def test_optional_abilities_of_effects():
     assert {type(e) for e in CATALOGUE if e.has_basis} == {
         FieldGradient, MagneticPole, DriverOutputQuadratic, DriverParameterQuadratic,
     }  # fmt: skip
-    assert {e.id for e in CATALOGUE if e.has_code} == {e.id for e in DYNAMICS} | {"output_saturation"}
+    assert {e.id for e in CATALOGUE if e.has_code} == {e.id for e in DYNAMICS} | {"output_saturation", "periodic"}
+    assert {e.id for e in CATALOGUE if e.by_periodogram} == {"periodic", "periodic_rate", "periodic_output"}
     assert {e.id for e in CATALOGUE if e.simpler} == {"coupling", "sensor_lag", "sensor_clock_drift", "delay"}
     coulomb = dict.fromkeys(("stribeck_friction", "load_dependent_friction"), "coulomb_friction")
     linear = dict.fromkeys(("driver_parameter_quadratic", "driver_parameter_arrhenius"), "driver_parameter")

@@ -74,13 +74,16 @@ def candidates_of(
 def candidate_terms(
     prepared: PreparedSimulation, drivers: Sequence[Driver], effects: Sequence[Effect]
 ) -> tuple[Term, ...]:
-    """Return each effect that has a port in the simulation, with each of its drivers and each shape of its grid."""
+    """Return each effect that has a port in the simulation, with each of its drivers and each shape of its grid.
+
+    Without effects whose shape a periodogram finds.
+    """
     terms = []
     inputs = input_drivers(prepared)
     own = {driver.columns for driver in drivers if not _repeats_an_input(driver, prepared)}
     own |= {driver.columns for driver in inputs}
     for effect in effects:
-        places = ports_of(effect, prepared.ports)
+        places = () if effect.by_periodogram else ports_of(effect, prepared.ports)
         # an effect without roles, or with an optional driver, is also tried without a driver
         alone = not effect.roles or effect.driver_optional
         known = [*drivers, *(inputs if effect.driven_by_inputs else ())]

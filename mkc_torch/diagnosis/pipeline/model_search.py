@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -25,36 +24,43 @@ from mkc_torch.diagnosis.model.process_noise import (
 from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time
+from mkc_torch.diagnosis.pipeline.chains import (
+    chain_of_line,
+    chain_to,
+    chains_to_test,
+    other_ways,
+    without_replaced_curves,
+)
+from mkc_torch.diagnosis.pipeline.lines import Lines, PeriodicCandidates, with_line
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.pipeline.suspected import suspected_models
 from mkc_torch.diagnosis.pipeline.trail import trail_of
 from mkc_torch.diagnosis.score import basis_of, score, separation
 from mkc_torch.diagnosis.search.beam import BeamSearch
-from mkc_torch.diagnosis.search.candidate import Candidate, in_order
+from mkc_torch.diagnosis.search.candidate import Candidate
 from mkc_torch.diagnosis.search.columns import best_change
 from mkc_torch.diagnosis.search.moves import comes_by_exchange
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.search.screening import screened
-from mkc_torch.diagnosis.thresholds import FAR_LESS, KEPT, NAMED
+from mkc_torch.diagnosis.thresholds import FAR_LESS, KEPT
 from mkc_torch.nonlinear import NoFitError
 
 Keep = Callable[[StepwiseSearch], object]
 """A callback that receives the search so far, in case it is stopped."""
-
-_NEXT = 3
-"""Models that are asked in turn if held-out blocks refuse the only effect of the best."""
-
-_SAME_SCORE = 0.1
-"""Nats within which the scores of two fits of the same physics are equal."""
 
 _QUICK_MODELS = 8
 """Largest number of models in a quick look."""
 
 
 def search_models(
-    base: ProcessNoiseFit, terms: tuple[Term, ...], options: SearchOptions, generator: torch.Generator, keep: Keep
+    base: ProcessNoiseFit,
+    terms: tuple[Term, ...],
+    options: SearchOptions,
+    generator: torch.Generator,
+    keep: Keep,
+    lines: Lines = lambda _: None,
 ) -> StepwiseSearch:
     """Screen the candidates; if the strongest is significant, search the best set of effects and test each of them.
 
@@ -64,6 +70,7 @@ def search_models(
         options: of the diagnosis.
         generator: of the surrogates.
         keep: receives the search so far.
+        lines: the search for a line in a residual, whose candidates are searched with the others.
 
     Raises:
         NoFitError: the fit's trajectory is lost.
@@ -79,6 +86,9 @@ def search_models(
     if not terms:
         return replace(search, evidence=(_evidence(search, ground, options),), left=())
     first = _screened(fit, terms, options, generator)
+    others, line = first.p_value, lines(ground)
+    if line is not None and line.p_value <= options.level:
+        terms, first = (*terms, *line.terms), with_line(first, line, ground)
     keep(replace(search, first=first))
     search = replace(search, first=first, evidence=(_evidence(search, ground, options),))
     keep(search)
@@ -96,12 +106,17 @@ def search_models(
     if first.p_value > options.level:
         follow = _follow(beam) if not options.quick else ()
         return replace(search, left=(), first=replace(first, follow=follow))
-    tested = partial(_tested, search, beam=beam, base=base, options=options, generator=generator, keep=keep)
-    for chain in _in_turn(beam):
+    p_values = _PValues(others, line, lines)
+    tested = partial(
+        _tested, search, p_values=p_values, beam=beam, base=base, options=options, generator=generator, keep=keep
+    )
+    for chain in [*chains_to_test(beam), *chain_of_line(beam)]:
+        if others > options.level and not chain[0].fit.model.terms[0].effect.by_periodogram:
+            continue
         found = _in_either_way(chain, beam, tested)
         # the simpler model counts as a rival only if all its effects are significant
         if 0 < len(found.found) < len(chain) and beam.best.key != chain[-1].key:
-            again = _in_either_way(_chain(beam.best, beam), beam, tested)
+            again = _in_either_way(chain_to(beam.best, beam), beam, tested)
             found = again if len(again.found) > len(found.found) else found
         if found.found or not found.unconfirmed:
             return found
@@ -114,7 +129,7 @@ def _in_either_way(
 ) -> StepwiseSearch:
     """Test a chain of models, and if an effect is not significant another chain; return the longer result."""
     found = tested(chain)
-    for other in _other_ways(chain, len(found.found), beam):
+    for other in other_ways(chain, len(found.found), beam):
         again = tested(other)
         found = again if len(again.found) > len(found.found) else found
     return found
@@ -186,89 +201,33 @@ def _goodness(fit: FittedModel) -> tuple[GoodnessOfFit, ...]:
     return goodness_of_fit(fit.model.prepared, fit.residual, {})
 
 
-def _in_turn(beam: BeamSearch) -> list[list[Candidate]]:
-    """Return chains of models to test: that of the simplest good model, and models with one effect.
+@dataclass(frozen=True)
+class _PValues:
+    """The p-values of effects: of a periodic effect that of the line, of all others that of the screening.
 
-    The simplest good model has the lowest price of those that this recording cannot separate from the highest score,
-    and each of its effects raises the score: effects that only gain together have no null in which the first is missing
-    alone. The screening has shown that an effect is missing, so the simulation alone is no rival of models with one
-    effect: those that are more likely are tested if the first chain is refused.
-    """
-    alone = beam.models[()]
-    least = -math.inf if alone.score is None else alone.score.log_likelihood
-    usable = [
-        model
-        for model in beam.models.values()
-        if model.fit.model.terms
-        and model.score is not None
-        and model.score.log_likelihood > least
-        and not beam.enlarges(model)
-    ]
-    ranked = sorted(_named(usable, alone), key=lambda model: -model.value)
-    single = [[model] for model in ranked if len(model.fit.model.terms) == 1]
-    good = [model for model in ranked if model.value > alone.value]
-    behind = beam.settings.naming.separable * beam.basis.kappa
-    alike = [model for model in good if model.value >= good[0].value - behind]
-    for model in [*_by_price(alike, beam.terms), *good[len(alike) :]]:
-        chain = _chain(model, beam)
-        if all(later.value > earlier.value for earlier, later in itertools.pairwise([alone, *chain])):
-            return [chain, *[other for other in single if other[0].key != chain[0].key]][:_NEXT]
-    return single[:_NEXT]
-
-
-def _by_price(models: Sequence[Candidate], terms: Sequence[Term]) -> list[Candidate]:
-    """Order models by price, at equal price first those to first order in their columns, then by score.
-
-    The same dependence on a column can have two names, as a loss and as the parameter of this loss. Of models of equal
-    price and score with the same columns, the name that is first in the catalogue comes first.
+    Attributes:
+        others: of the screening at the simulation alone.
+        line: at the simulation alone; None without a line.
+        lines: the search for the line of another fit.
     """
 
-    def price(model: Candidate) -> tuple[float, int]:
-        return round(model.price, 6), sum(comes_by_exchange(term) for term in model.fit.model.terms)
+    others: float
+    line: PeriodicCandidates | None
+    lines: Lines
 
-    def columns(model: Candidate) -> list[tuple[str, ...]]:
-        return sorted(term.columns for term in model.fit.model.terms)
-
-    def place(model: Candidate) -> list[int]:
-        own = {term.key for term in model.fit.model.terms}
-        return sorted(number for number, term in enumerate(terms) if term.key in own)
-
-    ordered = sorted(models, key=price)
-    for number, model in enumerate(ordered):
-        same = [
-            other
-            for other in ordered[number:]
-            if price(other) == price(model) and columns(other) == columns(model) and any(columns(model))
-            if abs(other.value - model.value) < _SAME_SCORE
-        ]
-        if same:
-            first = min(same, key=place)
-            ordered.remove(first)
-            ordered.insert(number, first)
-    return ordered
-
-
-def _named(models: Sequence[Candidate], alone: Candidate) -> list[Candidate]:
-    """Return the models, without those whose curve follows hardly better than a model of named effects.
-
-    A curve can follow any physics; it is the answer where no effect of the catalogue comes near.
-    """
-    curves = {model.key: any(term.effect.is_curve for term in model.fit.model.terms) for model in models}
-    named = [model for model in models if not curves[model.key] and model.value > alone.value]
-
-    def replaced(model: Candidate) -> bool:
-        return any(
-            len(other.fit.model.terms) <= len(model.fit.model.terms)
-            and other.log_typical_size <= model.log_typical_size + math.log(NAMED)
-            for other in named
-        )
-
-    return [model for model in models if not (curves[model.key] and replaced(model))]
+    def of(self, own: Term, previous: FittedModel, located: SearchResult, number: int) -> float:
+        """Return the p-value of an effect, the ``number``-th after the simulation alone, at the fit before it."""
+        if not own.effect.by_periodogram:
+            return located.p_value if number else self.others
+        free = previous if previous.open_loop is None else previous.open_loop
+        line = self.lines(free) if number else self.line
+        return 1.0 if line is None else line.p_of(own)
 
 
 def _tested(
     search: StepwiseSearch,
     chain: Sequence[Candidate],
+    p_values: _PValues,
     beam: BeamSearch,
     base: ProcessNoiseFit,
     options: SearchOptions,
@@ -282,8 +241,10 @@ def _tested(
     for number, step in enumerate(chain):
         previous = search.found[-1].fit if search.found else base.fit
         try:
-            located = search.first if number == 0 else _screened(previous, _left(previous, beam), options, generator)
+            own = step.fit.model.terms[-1]
+            located = search.first if number == 0 else _screened_with_line(previous, own, beam, options, generator)
             assert located is not None
+            located = replace(located, p_value=p_values.of(own, previous, located, number))
             if located.p_value > options.level:
                 break
             step = _final(step, beam, options, last=number == len(chain) - 1)
@@ -324,49 +285,20 @@ def with_step_of(search: StepwiseSearch, base: ProcessNoiseFit, options: SearchO
     return replace(search, found=tuple(found), evidence=tuple(evidence))
 
 
+def _screened_with_line(
+    fit: FittedModel, own: Term, beam: BeamSearch, options: SearchOptions, generator: torch.Generator
+) -> SearchResult:
+    """Screen the candidates that a model lacks; a periodic effect is added to them without a test."""
+    located = _screened(fit, _left(fit, beam), options, generator)
+    if not own.effect.by_periodogram:
+        return located
+    return replace(located, look=located.look.with_more([own]))
+
+
 def _left(fit: FittedModel, beam: BeamSearch) -> tuple[Term, ...]:
-    """Return the candidates that a model lacks."""
+    """Return the candidates of the screening that a model lacks."""
     before = {term.key for term in fit.model.terms}
-    return tuple(term for term in beam.terms if term.key not in before)
-
-
-def _chain(model: Candidate, beam: BeamSearch) -> list[Candidate]:
-    """Return models with 1, 2, … of a model's effects: the effect whose loss costs least score is the last."""
-    chain = [model]
-    while len(chain[0].fit.model.terms) > 1:
-        less = beam.with_one_less(chain[0])
-        if not less:
-            break
-        chain.insert(0, max(less, key=lambda candidate: candidate.value))
-    return _in_orders_of(chain)
-
-
-def _in_orders_of(chain: Sequence[Candidate]) -> list[Candidate]:
-    """Return a chain with the effects of each model in the order in which they enter."""
-    ordered = [chain[0]]
-    for model in chain[1:]:
-        before = ordered[-1]
-        ordered.append(in_order(model, [*before.fit.model.terms, *_missing(model, before)]))
-    return ordered
-
-
-def _other_ways(chain: Sequence[Candidate], reached: int, beam: BeamSearch) -> list[list[Candidate]]:
-    """Return chains that end a step behind the effects that were found, and reach it through other effects.
-
-    A linear screening may not see an effect while another is missing: a second vessel that fills only once the first
-    overflows.
-    """
-    if not 0 < reached < len(chain):
-        return []
-    last = {term.key for term in _missing(chain[reached], chain[reached - 1])}
-    ways = [less for less in beam.with_one_less(chain[reached]) if last & {term.key for term in less.fit.model.terms}]
-    ways.sort(key=lambda model: -model.value)
-    return [_in_orders_of([*_chain(way, beam), chain[reached]]) for way in ways[:1]]
-
-
-def _missing(model: Candidate, smaller: Candidate) -> list[Term]:
-    known = {term.key for term in smaller.fit.model.terms}
-    return [term for term in model.fit.model.terms if term.key not in known]
+    return tuple(term for term in beam.terms if term.key not in before and not term.effect.by_periodogram)
 
 
 def _final(step: Candidate, beam: BeamSearch, options: SearchOptions, *, last: bool) -> Candidate:
@@ -391,7 +323,7 @@ def _as_result(located: SearchResult, step: Candidate, beam: BeamSearch) -> Sear
     terms = located.scene.terms
     others = {term.key for term in fit.model.terms[:-1]}
     rivals: dict[Key, Candidate] = {}
-    for model in _named(list(beam.models.values()), beam.models[()]):
+    for model in without_replaced_curves(list(beam.models.values()), beam.models[()]):
         more = [term.key for term in model.fit.model.terms if term.key not in others]
         if len(model.fit.model.terms) == len(others) + 1 and len(more) == 1:
             known = rivals.get(more[0])

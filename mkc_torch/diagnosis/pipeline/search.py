@@ -15,11 +15,12 @@ from mkc_torch.diagnosis.model.process_noise import (
     fit_alone,
 )
 from mkc_torch.diagnosis.pipeline.build import impossible_rotations
+from mkc_torch.diagnosis.pipeline.lines import first_line_step, line_candidates, line_step
 from mkc_torch.diagnosis.pipeline.model_search import search_models, with_step_of
 from mkc_torch.diagnosis.pipeline.partial import PartialResult
 from mkc_torch.diagnosis.pipeline.prepare import Problem, SearchOptions
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
-from mkc_torch.diagnosis.pipeline.stepwise import first_step, next_step
+from mkc_torch.diagnosis.pipeline.stepwise import next_step
 from mkc_torch.diagnosis.score import basis_of, highest
 from mkc_torch.diagnosis.search.estimate import with_smaller_step
 from mkc_torch.nonlinear import NoFitError
@@ -39,13 +40,14 @@ def stepwise_search(problem: Problem, known: PartialResult, baseline: ProcessNoi
     generator = torch.Generator().manual_seed(options.seed)
     terms = () if impossible_rotations(baseline) else known.candidates[1]
     progress(f"trying {len(terms)} effects")
+    lines = partial(line_candidates, drivers=known.candidates[0].drivers, effects=known.effects, options=options)
     if baseline.fit.model.prepared.dynamics is not None:
-        whole = partial(search_models, baseline, terms, options, generator, known.keep_search)
+        whole = partial(search_models, baseline, terms, options, generator, known.keep_search, lines)
         search = known.continued("searching models", whole)
         repeated = known.improved("halving the step of integration", partial(at_smaller_step, known, search), search)
         known.keep_search(repeated)
         return repeated
-    first = partial(first_step, baseline.fit, terms, options, generator, known.keep_search)
+    first = partial(first_line_step, baseline.fit, terms, options, generator, known.keep_search, lines)
     search = known.continued("confirming the first finding", first)
     known.keep_search(search)
     while search.left:
@@ -56,6 +58,10 @@ def stepwise_search(problem: Problem, known: PartialResult, baseline: ProcessNoi
         known.keep_search(search)
         if search.found == before.found:
             break
+    if search.found and not search.cut and len(search.found) < options.max_findings:
+        last = partial(line_step, search, search.found[-1].fit, lines, options)
+        search = known.continued("searching a period", last, search)
+        known.keep_search(search)
     return search
 
 

@@ -77,10 +77,8 @@ def first_step(
 
     ``keep`` is called with the search so far.
     """
-    correlation = max(correlation_time(series) for series in base.pseudo(options.settings.noise)[0].unbind(1))
-    blocks = blocks_of(len(base.residual), math.ceil(correlation), options.settings.confirmation)
-    first = None
-    so_far = StepwiseSearch(None, (), None, blocks, (), terms)
+    so_far = search_before(base, terms, options)
+    blocks, first = so_far.blocks, None
     keep(so_far)
     if terms:
         first = _located(base, terms, options, generator, keep=lambda first: keep(replace(so_far, first=first)))
@@ -102,7 +100,14 @@ def first_step(
     except NoFitError:  # without a part of the recording there is no such course
         return taken
     # after a free course, little structure remains
-    return replace(_accept(replace(taken, first=cause), base, cause, options, after), left=())
+    return replace(accept(replace(taken, first=cause), base, cause, options, after), left=())
+
+
+def search_before(base: FittedModel, terms: tuple[Term, ...], options: SearchOptions) -> StepwiseSearch:
+    """Return the search before its first step, without evidence."""
+    correlation = max(correlation_time(series) for series in base.pseudo(options.settings.noise)[0].unbind(1))
+    blocks = blocks_of(len(base.residual), math.ceil(correlation), options.settings.confirmation)
+    return StepwiseSearch(None, (), None, blocks, (), terms)
 
 
 def next_step(
@@ -145,7 +150,7 @@ def _add(
         less = replace(less, left=search.left, first=search.first if search.found else further)
         return _add(less, fit, further, options)
     try:
-        return _accept(search, fit, located, options)
+        return accept(search, fit, located, options)
     except NoFitError:
         if search.found:
             raise
@@ -175,7 +180,12 @@ def _located(
 
 
 def _is_screened_out(search: StepwiseSearch, options: SearchOptions) -> bool:
-    """Whether the screening p-value after the last finding is too large for a further finding."""
+    """Whether the screening p-value after the last finding is too large for a further finding.
+
+    After a line there is always a further search: with the line in the residual, its noise is another.
+    """
+    if search.found[-1].term.effect.by_periodogram:
+        return False
     return _further_p_value(search, options) > max(options.settings.confirmation.screening_level, options.level)
 
 
@@ -192,10 +202,12 @@ def _further_p_value(search: StepwiseSearch, options: SearchOptions) -> float:
 
 def _shows_more(search: StepwiseSearch, options: SearchOptions) -> bool:
     """Whether the screening shows a further finding; False if it cannot see any (p-value 0)."""
+    if search.found[-1].term.effect.by_periodogram:
+        return False
     return not options.quick and 0.0 < _further_p_value(search, options) <= options.level
 
 
-def _accept(
+def accept(
     search: StepwiseSearch,
     previous: FittedModel,
     located: SearchResult,

@@ -44,6 +44,7 @@ from mkc_torch.effects.dynamics.stribeck_friction import StribeckFriction
 from mkc_torch.effects.dynamics.thermal_loss import ThermalLoss
 from mkc_torch.effects.dynamics.unknown_near_ends import UnknownNearEnds
 from mkc_torch.effects.dynamics.unknown_rate import UnknownRate
+from mkc_torch.effects.periodic import PeriodicOutput, PeriodicRate
 
 __all__ = ["DYNAMICS"]
 
@@ -93,6 +94,8 @@ DYNAMICS: tuple[Effect, ...] = (
     DriverOutputLagged(),
     SensorLag(),
     SensorClockDrift(),
+    PeriodicRate(),
+    PeriodicOutput(),
     UnknownRate("difference"),
     UnknownRate("own"),
     UnknownRate("position"),

@@ -22,6 +22,7 @@ from mkc_torch.effects.paired.gravity_sag import GravitySag, SeveralSag
 from mkc_torch.effects.paired.offset import Offset, SeveralOffsets
 from mkc_torch.effects.paired.output_backlash import OutputBacklash, SeveralBacklash
 from mkc_torch.effects.paired.output_saturation import OutputSaturation
+from mkc_torch.effects.periodic import Periodic
 
 __all__ = ["PAIRED"]
 
@@ -45,5 +46,6 @@ PAIRED: tuple[Effect, ...] = (
     DriverBoucWen(),
     DriverDahl(),
     DriverPair(),
+    Periodic(),
 )
 """The candidate effects for outputs of simulations without a state."""
