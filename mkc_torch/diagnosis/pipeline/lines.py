@@ -26,6 +26,10 @@ from mkc_torch.effects.base import Effect
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.protocol import PreparedSimulation
 
+_SHARE = 0.2
+"""Share of the level that a line is tested at, next to the test of all other effects: of both, at most 1.2 times the
+level alarm falsely (weights of Genovese, Roeder & Wasserman, Biometrika 93 (2006), 509)."""
+
 
 @dataclass(frozen=True)
 class PeriodicCandidates:
@@ -33,7 +37,7 @@ class PeriodicCandidates:
 
     Attributes:
         terms: a candidate for each place, with the line's period.
-        p_value: of the line.
+        p_value: of the line, over the share of the level that it is tested at.
         resolution: of the recording in Hz, the reciprocal of its length.
     """
 
@@ -93,7 +97,8 @@ def line_candidates(
         if term.key not in have and (prepared.dynamics is not None or channel in prepared.ports[term.port].channels)
     ]
     resolution = 1.0 / float(prepared.time.max() - prepared.time.min())
-    return PeriodicCandidates(tuple(terms), line.p_value, resolution) if terms else None
+    p_value = min(line.p_value / _SHARE, 1.0)
+    return PeriodicCandidates(tuple(terms), p_value, resolution) if terms else None
 
 
 def _signals(prepared: PreparedSimulation, drivers: Sequence[Driver]) -> list[Tensor]:
