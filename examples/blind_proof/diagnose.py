@@ -10,10 +10,11 @@ from torch import Tensor
 from examples.blind_proof.equations.simulations import class_of
 from examples.blind_proof.run import SIMULATIONS
 from mkc_torch.cli.console import ConsoleStyle
-from mkc_torch.cli.correction import correct, read_correction
 from mkc_torch.cli.diagnosis_files import diagnose_file, named_simulation
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Request
+from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.protocol import Simulation
 
 _QUIET = ConsoleStyle(terminal=False, width=100)
 
@@ -38,7 +39,13 @@ def apply(model: Path, path: Path) -> Mapping[str, Tensor]:
     """Correct a second recording."""
     simulation = request_for(path, path.parent.parent / SIMULATIONS / f"{path.stem}.py").simulation
     chosen = None if simulation == MAGNETOMETER else named_simulation(simulation)
-    return correct(read_correction(model, chosen), Recording.read(path)).columns
+    return corrected_columns(model, chosen, Recording.read(path))
+
+
+def corrected_columns(model: Path, simulation: Simulation | None, recording: Recording) -> Mapping[str, Tensor]:
+    """Return the columns that a model.json corrects, by the names of a recording."""
+    known = DiagnosedModel.from_json(model.read_text(encoding="utf-8"), simulation=simulation)
+    return known.correct(recording)[0]
 
 
 def request_for(recording: Path, simulation: Path) -> Request:

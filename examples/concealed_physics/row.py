@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from examples.blind_proof.diagnose import corrected_columns
 from examples.blind_proof.run import content_of
-from mkc_torch.cli.correction import correct, read_correction
 from mkc_torch.cli.diagnosis_files import simulation_of
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Request
 from mkc_torch.recording.recording import Recording
@@ -82,7 +82,7 @@ def _open_loop(model: Path, recording: Path, request: Request) -> dict[str, floa
         return {}
     table = Recording.read(recording, recognise=False)
     try:
-        simulated = correct(read_correction(model, simulation_of(request)), table).columns
+        simulated = corrected_columns(model, simulation_of(request), table)
     except ValueError:  # a model that does not transfer
         return {}
     outputs = [name for name in simulated if name not in ("time", "experiment") and name in table]

@@ -13,11 +13,12 @@ from mkc_torch.diagnosis.model.suspect import texts_of
 from mkc_torch.diagnosis.optional import optional_steps
 from mkc_torch.diagnosis.pipeline.partial import PartialResult, build_result, cut_short, estimate, run_tests
 from mkc_torch.diagnosis.pipeline.prepare import Problem, SearchOptions, prepare
-from mkc_torch.diagnosis.pipeline.restarts import restarted_problem, with_restarts_stated
+from mkc_torch.diagnosis.pipeline.restarts import restarted_problem, with_restarts_stated, without_restarts_stated
 from mkc_torch.diagnosis.pipeline.search import fit_baseline, stepwise_search
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.diagnosis.thresholds import LEVEL
+from mkc_torch.diagnosis.verdict import EACH_OUTPUT, UNFIT, failed_rules
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.nonlinear import NoFitError
@@ -119,7 +120,7 @@ def diagnose(
 def _with_or_without_restarts(
     problem: Problem, recording: Recording | Sequence[Recording], limit: float, begin: float
 ) -> Diagnosis:
-    """Return the diagnosis of the free run; where it is unfit and one with restarts explains the recording, that.
+    """Return the diagnosis of the free run; where it does not follow and one with restarts explains it, that.
 
     Segments can follow a simulation that is wrong, by their initial states. So if a fit of the free run is found, only
     named physics that explains the segments replaces its verdict; a column with a wrong sign or unit explains it.
@@ -133,16 +134,18 @@ def _with_or_without_restarts(
             raise
         return with_restarts_stated(_result_of(again, PartialResult(again), limit, begin), again, found=False)
     wrong_column = known.search is not None and known.search.column
-    if result.verdict != "unfit" or result.stop is not None or wrong_column:
+    if not {UNFIT, EACH_OUTPUT} & set(failed_rules(result.decisions)) or result.stop is not None or wrong_column:
         return result
     again = restarted_problem(problem, recording, limit, begin)
     if again is None:
-        return result
+        return without_restarts_stated(result, problem, None)
     try:
         restarted = _result_of(again, PartialResult(again), limit, begin)
     except NoFitError:
-        return result
-    return with_restarts_stated(restarted, again, found=True) if restarted.verdict == "explained" else result
+        return without_restarts_stated(result, problem, again)
+    if restarted.verdict != "explained":
+        return without_restarts_stated(result, problem, again)
+    return with_restarts_stated(restarted, again, found=True)
 
 
 def _result_of(problem: Problem, known: PartialResult, limit: float, begin: float) -> Diagnosis:

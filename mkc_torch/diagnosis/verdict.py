@@ -45,6 +45,9 @@ _REJECTED = 0.5
 UNFIT = "explained_share"
 """Rule that a simulation has to pass for any verdict but unfit."""
 
+EACH_OUTPUT = "each_output"
+"""Rule that a simulation without findings follows every output."""
+
 EXPLAINS_MORE = "simulation_explains_more"
 """Rule that the simulation explains more of the outputs' variation than the correction by its findings."""
 
@@ -167,7 +170,7 @@ def _on_all(
             "of all outputs."
         )
         value = None if worst is None else worst.explained
-        yield _decision("each_output", value, settings.followed, passed=passed, sentence=text)
+        yield _decision(EACH_OUTPUT, value, settings.followed, passed=passed, sentence=text)
     elif flexible and known.corrected:
         yield _explains_more(known, settings)
     text = f"The residual is correlated up to a lag of {left.lag:g} samples." if left.lag else "The residual is white."

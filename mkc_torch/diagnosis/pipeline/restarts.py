@@ -94,6 +94,28 @@ def with_restarts_stated(result: Diagnosis, problem: Problem, *, found: bool) ->
     return replace(result, warnings=(sentence, *result.warnings), environment=environment)
 
 
+def without_restarts_stated(result: Diagnosis, problem: Problem, again: Problem | None) -> Diagnosis:
+    """Return the diagnosis of a free run that is unfit, with a note on the segments that were tried.
+
+    Args:
+        result: of the free run.
+        problem: with the simulation as given.
+        again: the problem with restarts that do not explain the recording; None if no length follows it.
+    """
+    if not isinstance(problem.simulation, Dynamics) or problem.simulation.restart_after is not None:
+        return result
+    if again is None:
+        note = "Segments with initial states of their own do not follow the recording by its inputs either."
+    else:
+        assert isinstance(again.simulation, Dynamics)
+        seconds = again.simulation.restart_after
+        note = (
+            f"The simulation follows segments of {seconds:.4g} s, but no physics in the catalogue explains them: give "
+            f"it `restart_after = {seconds!r}` for a diagnosis of the segments."
+        )
+    return replace(result, notes=(*result.notes, note))
+
+
 def segment_lengths(time: Float[Tensor, " N"], begins: Bool[Tensor, " N"], states: int) -> tuple[float, ...]:
     """Return the lengths in s to try: the longest run, halved until a segment has few samples.
 

@@ -16,10 +16,12 @@ from mkc_torch.diagnosis.pipeline.restarts import (
     segment_lengths,
     segment_polynomials,
     with_restarts_stated,
+    without_restarts_stated,
 )
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import CATALOGUE
 from tests.diagnosis.duffing import Duffing, PullingBack, duffing_recording
+from tests.diagnosis.factory import make_diagnosis
 
 
 def restarted(simulation, recording, effects=()):
@@ -87,6 +89,23 @@ def test_friction_of_a_chaotic_oscillator_is_found_with_restarts_and_these_are_s
     assert f"restarted every {seconds:.4g} s" in found.warnings[0]
     assert json.loads(diagnosis_to_json(found))["search"]["restart_after"] == seconds
     assert f"restart_after = {seconds!r}" in found.model.to_python("shakers")
+
+
+def problem_of(simulation):
+    options = SearchOptions(0.05, 19, 3, 0, Settings())
+    return prepare(simulation, duffing_recording(0, 100), (), options, None, lambda _: None)
+
+
+def test_the_segments_that_were_tried_are_noted():
+    result, free = make_diagnosis(0, verdict="unfit"), problem_of(Duffing())
+    (none,) = set(without_restarts_stated(result, free, None).notes) - set(result.notes)
+    assert "do not follow the recording" in none
+    (some,) = set(without_restarts_stated(result, free, problem_of(Duffing().with_restarts(2.5))).notes) - set(
+        result.notes
+    )
+    assert "segments of 2.5 s" in some
+    assert "`restart_after = 2.5`" in some
+    assert without_restarts_stated(result, problem_of(Duffing().with_restarts(2.0)), None) is result
 
 
 def test_restarts_of_the_user_have_precedence():
