@@ -216,7 +216,7 @@ def at_input(size: SizeAtInput | None) -> str:
 
     Example:
         >>> at_input(SizeAtInput("torque", (EffectParameter("friction", 0.0497, 0.0003, "N m"),)))
-        'the same as friction 0.0497 ± 0.0003 N m at the input torque'
+        'the same as friction 0.04970 ± 0.00030 N m at the input torque'
     """
     if size is None:
         return ""
