@@ -201,9 +201,11 @@ def strangers(shared: Path = SHARED) -> Iterator[Known]:
     clock = Expected((("sensor_clock_drift",),), verdicts=USEFUL, residual={"position": 1.15 * 0.0111})
     yield stranger("fast_clock", "Stage", clock)
     yield stranger("wrong_sign", "Pendulum", Expected(verdicts=("unfit", "unexplained")))
-    yield stranger("sagging_battery", "Quad", Expected((("driver_input_gain",),), verdicts=USEFUL))
-    # the temperature acts on the resistance, which no effect of the catalogue reaches
-    yield stranger("warm_cell", "Cell", Expected(refused=("driver_input_gain",), verdicts=("unexplained",)))
+    # the lift multiplies the thrust, so the battery acts on either
+    battery = ("driver_input_gain", "driver_parameter", "driver_parameter_quadratic")
+    yield stranger("sagging_battery", "Quad", Expected((battery,), verdicts=USEFUL))
+    heat = ("driver_parameter_arrhenius", "driver_parameter_quadratic", "driver_parameter")
+    yield stranger("warm_cell", "Cell", Expected((heat,), ("parameter",), ("driver_input_gain",)))
 
 
 def data(shared: Path = SHARED) -> Iterator[Known]:
