@@ -68,6 +68,7 @@ def check_file(
             texts = {"check.json": found.to_json(), "check.html": check_report(found)}
             for name, text in texts.items():
                 write_atomically(folder / name, text, overwrite=request.force)
+    # the user's simulation can raise anything: a row of the table, and the other recordings are checked
     except Exception as error:
         own = raised_in(request.simulation, error) if is_file_of_a_simulation(request.simulation) else None
         return CheckedFile(path, None, error=failure_sentence(path, "", own or error))

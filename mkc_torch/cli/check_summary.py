@@ -25,8 +25,10 @@ def show_checks(console: Console, checked: Sequence[CheckedFile]) -> None:
     if not known:
         return
     table = Table(box=None, padding=(0, 3, 0, 0), show_edge=False)
-    for name, how in (("recording", "left"), ("output", "left"), ("without", "right"), ("with findings", "right")):
-        table.add_column(name, justify=how)  # type: ignore[arg-type]
+    for name in ("recording", "output"):
+        table.add_column(name)
+    for name in ("without", "with findings"):
+        table.add_column(name, justify="right")
     table.add_column("ratio (95 %)", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
     for file, check in known:

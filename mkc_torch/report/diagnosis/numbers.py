@@ -212,7 +212,7 @@ def largest(parameter: EffectParameter) -> str:
 
 
 def at_input(size: SizeAtInput | None) -> str:
-    """Format the size of an effect in the unit of the input that moves its rate; empty if there is none.
+    """Format the size of an effect in the unit of the input that moves its rate; empty for an unknown size.
 
     Example:
         >>> at_input(SizeAtInput("torque", (EffectParameter("friction", 0.0497, 0.0003, "N m"),)))

@@ -135,11 +135,14 @@ def gain_of(prepared: Enterable, name: str, theta: Float[Tensor, " p"]) -> Float
 
 
 def lone_input(prepared: Known, state: str) -> str | None:
-    """The only input that moves a rate, if it moves no other rate and in proportion to itself; None if there is none.
+    """The only input that moves a rate, if it moves no other rate, and this one in proportion to itself.
 
     Args:
         prepared: the system.
         state: whose rate it is.
+
+    Returns:
+        None without such an input.
     """
     system = prepared.system
     gains = _gains(system, prepared.known)

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
+from examples.concealed_physics.known import SHARED
 from mkc_torch.diagnosis.noise.floor import white_noise
 from tests.gate.fits import read_recording
 from tests.gate.work import known_answers
@@ -105,7 +106,7 @@ def test_rounding_is_the_least():
 def test_the_noise_of_simulated_recordings_is_within_a_factor_or_unknown(case):
     jobs = [known for known in known_answers(("cases", "strangers")) if case in known.name]
     if not jobs:
-        pytest.skip(f"the recordings of {case} are absent")
+        pytest.skip(f"no recording of {case} in {SHARED / 'cases'}")
     for job in jobs:
         recording = read_recording(job.recording, job.request)
         for name, size in KNOWN[case].items():

@@ -1,6 +1,7 @@
 """`python corrected.py NEW.csv` gives the numbers of `mkc check`, and those of an integration by SciPy."""
 
 import importlib.util
+import inspect
 import subprocess
 import sys
 
@@ -21,19 +22,7 @@ from mkc_torch.recording.recording import write_table
 from mkc_torch.simulation import load_simulation
 from tests.diagnosis.validation.tank import Tank, tank_recording, usual_model
 
-SOURCE = """
-from mkc_torch.simulation import Dynamics, Parameter
-
-
-class Tank(Dynamics):
-    states = ("level",)
-    inputs = ("inflow",)
-    parameters = {"drain": Parameter(0.4, lower=0.0, unit="1/s")}
-    units = {"level": "m", "inflow": "m/s"}
-
-    def derivative(self, time, x, u, p):
-        return {"level": u.inflow - p.drain * x.level}
-"""
+SOURCE = f"from mkc_torch.simulation import Dynamics, Parameter\n\n\n{inspect.getsource(Tank)}"
 
 
 @pytest.fixture(scope="module")
