@@ -253,6 +253,12 @@ def worth_correcting(finding: Finding) -> bool:
     return finding.grade == "left_out"
 
 
+def counts(finding: Finding) -> bool:
+    """Whether a finding belongs into the corrected model: confirmed, or not tested and of a possible size."""
+    untested = finding.held_out is None and not finding.cannot_be
+    return finding.grade != "unconfirmed" or untested
+
+
 def transfers(finding: Finding) -> bool:
     """Whether a finding can be applied to another recording.
 

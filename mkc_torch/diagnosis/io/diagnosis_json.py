@@ -308,6 +308,7 @@ def _score(score: HeldOutScore) -> dict[str, Any]:
         "rmse": score.rmse,
         "sigma": [_sigma(s) for s in score.sigma],
         "d": score.d,
+        **({"outputs": {name: asdict(size) for name, size in score.outputs.items()}} if score.outputs else {}),
     }
 
 
