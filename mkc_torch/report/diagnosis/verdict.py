@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import shlex
 from collections.abc import Sequence
@@ -10,11 +9,11 @@ from typing import NamedTuple
 
 from mkc_torch._support.typesetting import capital, plain, several
 from mkc_torch.diagnosis.result import UNFINISHED, VERDICT_SENTENCES, Diagnosis, Finding, notices
-from mkc_torch.diagnosis.verdict import DiagnosisDoubt, Status, conclusion, doubted_signs, rejected_share
+from mkc_torch.diagnosis.verdict import Answer, DiagnosisDoubt, conclusion, doubted_signs, rejected_share
 from mkc_torch.diagnosis.vetoes import is_small, transfers, worth_correcting
 from mkc_torch.report.diagnosis.findings import NOT_TESTED, finding_name, inseparable, rivals, unrecorded, with_names
 from mkc_torch.report.diagnosis.unseen import residual_of_all
-from mkc_torch.report.words.numbers import share, size
+from mkc_torch.report.words.numbers import share
 from mkc_torch.report.words.verdict import disturbed
 
 _MOST_REJECTED = "Most samples were rejected"
@@ -35,9 +34,9 @@ class RunPaths(NamedTuple):
     options: tuple[str, ...]
 
 
-def status(diagnosis: Diagnosis) -> Status:
-    """Return the status of the headline."""
-    return conclusion(diagnosis).status
+def answer_word(diagnosis: Diagnosis) -> Answer:
+    """Return the answer in one word, by which the headline is coloured."""
+    return conclusion(diagnosis).answer
 
 
 _LOOK: dict[DiagnosisDoubt, str] = {
@@ -127,8 +126,7 @@ def _kind(finding: Finding) -> str:
 def _named(finding: Finding, *, alone: bool) -> str:
     name, others = finding_name(finding), inseparable(finding)
     if finding.grade == "nearest":
-        gain = finding.shape.free_curve_gain if finding.shape is not None else math.nan
-        return f"{name} (a free curve of the same variables gains {size(gain)} nats)" if math.isfinite(gain) else name
+        return f"{name} (a free curve of the same variables is clearly better)"
     if not others:
         return name
     if not alone:
