@@ -74,7 +74,7 @@ def test_the_scores_have_the_size_of_each_output_in_its_unit_if_known():
     assert content["corrected"]["outputs"]["rate"] == {"rmse": 0.3, "unit": "rad/s"}
     assert "outputs" not in content["baseline"]
     content["corrected"]["outputs"]["rate"]["rmse"] = -1.0
-    with pytest.raises(DiagnosisFileError, match="corrected[.]outputs[.]rate[.]rmse"):
+    with pytest.raises(DiagnosisFileError, match=r"corrected\.outputs\.rate\.rmse"):
         validate(content)
 
 
