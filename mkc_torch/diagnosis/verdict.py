@@ -361,8 +361,12 @@ class Conclusion:
         if self.check:
             return self.check
         if quick and self.grades:
-            return "Confirm it by a full diagnosis."  # a quick look tests no held-out blocks
-        return "The simulation can be used within the range of this recording." if self.verdict == "adequate" else ""
+            return "Confirm this by a full diagnosis."  # a quick look leaves tests out
+        if self.verdict != "adequate":
+            return ""
+        if self.doubts:
+            return "Find out why so many samples were rejected before the simulation is used."
+        return "The simulation can be used within the range of this recording."
 
 
 def conclude(

@@ -73,7 +73,8 @@ def test_no_trail_gives_two_statements_that_contradict(trail):
         assert found.grades
         assert set(found.grades) <= {"left_out", "small"}
     # the advice
-    assert ("can be used" in advice) == (found.verdict == "adequate")
+    assert ("can be used" in advice) == (found.verdict == "adequate" and not doubts and not found.stopped)
+    assert ("before the simulation is used" in advice) == (found.verdict == "adequate" and bool(doubts))
     assert ("Do not rely" in advice) == (found.verdict == "unfit" and not found.stopped)
     assert not doubted_signs(trail) or found.verdict == "unexplained"
 

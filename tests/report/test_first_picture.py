@@ -196,3 +196,18 @@ def test_the_headline_has_the_colour_of_the_answer():
     styles = dict(re.findall(r"h1\.(\w+), \.\1 \.answer \{ color: var\(--(\w+)\)", page))
     assert len(set(styles.values())) == 3
     assert set(styles) == {"usable", "look", "unusable"}
+
+
+def test_of_a_curve_values_within_the_samples_are_stated_and_no_coefficient():
+    made = make_diagnosis(3, samples=300)
+    curve = made.findings[2].curve
+    value, band = curve.value.clone(), curve.band.clone()
+    value[:10], band[:10] = torch.nan, torch.nan
+    gap = dataclasses.replace(made.findings[2], curve=dataclasses.replace(curve, value=value, band=band))
+    made = dataclasses.replace(made, findings=(*made.findings[:2], gap))
+    text = text_of(diagnosis_report(made))
+    assert "knots" not in text
+    assert "nan" not in text.lower()
+    first = float(curve.x[10])
+    assert f"at temperature {first:.1f} °C: " in text
+    assert f"at temperature {float(curve.x[0]):.1f} °C: " not in text

@@ -9,6 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 from mkc_torch._support.typesetting import plain, several, typeset
 from mkc_torch.diagnosis.environment import Grade, Run
 from mkc_torch.diagnosis.result import Alternative, CandidateScore, EffectParameter, Finding, Region
+from mkc_torch.diagnosis.vetoes import is_refused_by_blocks, refusal
 from mkc_torch.effects import is_curve, words_of
 from mkc_torch.report.diagnosis.evidence import of_driver
 from mkc_torch.report.diagnosis.numbers import TimeFormat, curve_lines, largest, probability
@@ -248,6 +249,8 @@ def grade(finding: Finding) -> str:
         return "not confirmed: impossible size"
     if finding.grade == "unconfirmed" and finding.held_out is None:
         return NOT_TESTED
+    if finding.grade == "unconfirmed" and not is_refused_by_blocks(finding):
+        return f"not confirmed: {refusal(finding)}"
     return _GRADES[finding.grade]
 
 

@@ -9,7 +9,7 @@ from mkc_torch._support.typesetting import capital, plain, typeset
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.effects import is_curve
 from mkc_torch.report.diagnosis.environment import noise_lines, output_lines
-from mkc_torch.report.diagnosis.findings import acts_on, finding_name, grade, inseparable, rivals, where
+from mkc_torch.report.diagnosis.findings import acts_on, curve_values, finding_name, grade, inseparable, rivals, where
 from mkc_torch.report.diagnosis.noise import noise_model, smooth_fit
 from mkc_torch.report.diagnosis.numbers import at_input, clock_of, evidence, largest, probability
 from mkc_torch.report.diagnosis.unseen import better, diverged, residual_of_all, residuals
@@ -96,9 +96,10 @@ def _in_short(finding: Finding, diagnosis: Diagnosis) -> Iterator[str]:
 
 
 def _sizes(finding: Finding, most: int) -> str:
-    """Format the first parameters; empty for a curve, which its figure shows."""
+    """Format the first parameters; of a curve its values at the first and the last place with samples."""
     if is_curve(finding.effect):
-        return ""
+        values = curve_values(finding)
+        return "; ".join(dict.fromkeys([*values[:1], *values[-1:]]))
     return "; ".join(filter(None, [*(largest(p) for p in finding.parameters[:most]), at_input(finding.at_input)]))
 
 
