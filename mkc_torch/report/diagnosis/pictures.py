@@ -55,7 +55,7 @@ def over_time(diagnosis: Diagnosis) -> str:
     t, findings = diagnosis.traces, diagnosis.findings
     corrected = any(counts(finding) for finding in findings)
     above, known = numbered(diagnosis), floors(diagnosis)
-    panels = Panels(2 if corrected else 1, margins=Margins(top=0.55 if above else 0.35))
+    panels = Panels(2, margins=Margins(top=0.55 if above else 0.35))
     with style():
         for row in range(min(len(t.channels), _MOST_ROWS)):
             axes = [panels.axes() for _ in MOMENTS[: 2 if corrected else 1]]
