@@ -9,9 +9,6 @@ from typing import Any
 from mkc_torch._support.typesetting import typeset
 from mkc_torch.diagnosis.result import DensityCheck, DriverShift, EvidenceResult
 
-_FAR = 1000
-"""Nats per sample beyond which no exact gain is shown: one of the models leaves the domain of the density."""
-
 _DRIVEN_BY = "driven by"
 """Label of rows that are shown with the driver's name."""
 
@@ -57,6 +54,7 @@ def rows(evidence: Sequence[EvidenceResult], *, terminal: bool = False) -> list[
     """Return the other rows, with their labels.
 
     Example:
+        >>> from mkc_torch.diagnosis.result import Extrapolation
         >>> results = [EvidenceResult("extrapolation", Extrapolation(0.31, (0.28, 0.35)))]
         >>> rows(results)[0][0], rows(results, terminal=True)
         ('beyond its range', [])
