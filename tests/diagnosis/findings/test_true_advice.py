@@ -302,6 +302,11 @@ def test_each_option_that_a_message_names_is_one_of_the_command(folder, commands
     assert {option for option, _ in named if option not in there | OF_OTHER_PROGRAMS} == set(), named
 
 
+def test_each_option_that_any_message_names_exists():
+    known = set().union(*options_of_commands().values(), {"--version"})
+    assert {option for option, _ in named_options("") if option not in known | OF_OTHER_PROGRAMS} == set()
+
+
 def test_the_proposed_command_has_options_of_apply_only():
     from mkc_torch.cli.units_option import reading_options
 
