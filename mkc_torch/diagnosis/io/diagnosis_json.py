@@ -342,6 +342,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "plausibility": f.plausibility,
         **({} if f.region is None else {"region": asdict(f.region)}),
         **({"experiments": f.experiments} if f.experiments else {}),
+        **({"recordings": f.recordings} if f.recordings else {}),
         **({"event_times": f.event_times} if f.event_times else {}),
         **({"references": [asdict(reference) for reference in f.references]} if f.references else {}),
         **({"advice": f.advice} if f.advice else {}),

@@ -297,8 +297,8 @@ def _screened_with_line(
 
 def _left(fit: FittedModel, beam: BeamSearch) -> tuple[Term, ...]:
     """Return the candidates of the screening that a model lacks."""
-    before = {term.key for term in fit.model.terms}
-    return tuple(term for term in beam.terms if term.key not in before and not term.effect.by_periodogram)
+    before = {term.family for term in fit.model.terms}
+    return tuple(term for term in beam.terms if term.family not in before and not term.effect.by_periodogram)
 
 
 def _final(step: Candidate, beam: BeamSearch, options: SearchOptions, *, last: bool) -> Candidate:

@@ -22,6 +22,7 @@ from mkc_torch.diagnosis.search.move_fits import (
     fits_at_own_holds,
     fitted_exchanged,
     fitted_held,
+    fitted_in_form,
     fitted_reordered,
     fitted_simpler,
     fitted_through_noise,
@@ -201,11 +202,15 @@ class BeamSearch:
                 rest = [other for other in fit.model.terms if other is not term]
                 works.append((model_key(rest), f"drop {self._id(term)}", partial(fitted_without, fit, number)))
             for other in special_cases(term, self.terms, fit.model.prepared):
-                if other.key in {known.key for known in fit.model.terms}:
+                if other.family in {known.family for known in fit.model.terms if known is not term}:
                     continue
                 rest = [*fit.model.terms[:number], *fit.model.terms[number + 1 :], other]
                 move = f"exchange {self._id(term)} for {self._id(other)}"
-                works.append((model_key(rest), move, partial(fitted_exchanged, fit, number, self._all(other, term))))
+                if other.family == term.family:
+                    work = partial(fitted_in_form, fit, number, other)
+                else:
+                    work = partial(fitted_exchanged, fit, number, self._all(other, term))
+                works.append((model_key(rest), move, work))
         orders = in_other_orders(fit)
         works += [(model_key(o), "another order in series", partial(fitted_reordered, fit, o)) for o in orders]
         self._fit(works, fit, most)

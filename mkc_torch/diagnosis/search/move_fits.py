@@ -195,6 +195,27 @@ def fitted_reordered(fit: FittedModel, terms: tuple[Term, ...]) -> FittedModel |
         return None
 
 
+def fitted_in_form(fit: FittedModel, number: int, term: Term) -> FittedModel | None:
+    """Return the fit with a size of each recording in place of an effect's common size, or the other way round.
+
+    Args:
+        fit: with the effect.
+        number: of the effect.
+        term: the effect in the other form; its shape starts as it is.
+    """
+    parts = list(fit.model.gammas(fit.parameters))
+    own, k = parts[number], len(term.effect.recordings or fit.model.terms[number].effect.recordings)
+    parts[number] = own.repeat_interleave(k) if term.effect.recordings else own.unflatten(0, (-1, k)).mean(-1)
+    terms = list(fit.model.terms)
+    terms[number] = replace(terms[number], effect=term.effect)
+    model = JointModel(fit.model.prepared, terms, fit.model.near)
+    start = torch.cat([fit.parameters[: fit.model.base], *parts])
+    try:
+        return shape_fitted(fitted(model, start, fit.bound, graduate=False, effort=SEARCH), SEARCH)
+    except NoFitError:
+        return None
+
+
 def fitted_simpler(fit: FittedModel, number: int) -> FittedModel | None:
     """Return the fit with the simpler form of an effect, such as equal exchange of two states; None without that."""
     start = simpler_start(fit, number) if fit.model.terms[number].effect.simpler is not None else None

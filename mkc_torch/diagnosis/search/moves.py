@@ -100,12 +100,13 @@ def additions(fit: FittedModel, terms: Sequence[Term], settings: NoiseSettings) 
 
     Args:
         fit: the model.
-        terms: candidates with the shapes of their grids; effects that the model has are left out, and those that act as
-            the model's parameters do, which would only undo the bounds of these.
+        terms: candidates with the shapes of their grids; effects that the model has are left out, with a common size or
+            a size of each recording, and those that act as the model's parameters do, which would only undo the bounds
+            of these.
         settings: which samples count.
     """
-    known = {term.key for term in fit.model.terms}
-    terms = [term for term in terms if term.key not in known]
+    known = {term.family for term in fit.model.terms}
+    terms = [term for term in terms if term.family not in known]
     if not terms:
         return []
     gains, sizes = linear_gains(fit, terms, settings)
@@ -206,7 +207,8 @@ def _longest_run(prepared: PreparedSimulation) -> float:
 def special_cases(term: Term, terms: Sequence[Term], prepared: PreparedSimulation) -> list[Term]:
     """Return the candidates that are a special case of an effect, or that it is one of, at the same channels.
 
-    Of a dependence on a column also its other forms, which have the same special case.
+    Of a dependence on a column also its other forms, which have the same special case. A common size is a special case
+    of a size for each recording.
     """
     channels = prepared.ports[term.port].channels
     found = []
@@ -217,6 +219,7 @@ def special_cases(term: Term, terms: Sequence[Term], prepared: PreparedSimulatio
         )
         if comes_by_exchange(term) and comes_by_exchange(other) and other.effect.id != term.effect.id:
             nested = nested or _special_id(other) == _special_id(term)
+        nested = nested or (other.family == term.family and other.key != term.key)
         alike = other.columns == term.columns or not (other.columns and term.columns)
         if nested and prepared.ports[other.port].channels == channels and alike:
             found.append(other)
@@ -233,10 +236,11 @@ def comes_by_exchange(term: Term) -> bool:
 
 
 def one_form_each(found: Sequence[Addition], worth: Callable[[Addition], float]) -> list[Addition]:
-    """Return additions with one form of each dependence on a column: the first order, unless another is worth more.
+    """Return additions with one form of each effect: the first order of its dependence on a column, and a common size
+    for all recordings, unless another form is worth more.
 
-    Otherwise the forms of one dependence would take the places of other effects. A further form whose special case is
-    not among the additions comes only in exchange.
+    Otherwise the forms of one effect would take the places of other effects. A further form whose special case is not
+    among the additions comes only in exchange.
 
     Args:
         found: the additions.
