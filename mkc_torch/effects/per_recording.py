@@ -96,7 +96,8 @@ class PerRecording(Effect):
         return self.effect.explained(self._mean(gamma), shape, context)
 
     def advised(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
-        return self.effect.advised(self._mean(gamma), shape, context)
+        plain = self.effect.advised(self._mean(gamma), shape, context)
+        return f"{plain} Find what changed between the recordings, and give each its own size."
 
     def _mean(self, gamma: Sequence[float]) -> list[float]:
         k = len(self.recordings)

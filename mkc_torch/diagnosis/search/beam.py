@@ -204,13 +204,16 @@ class BeamSearch:
             for other in special_cases(term, self.terms, fit.model.prepared):
                 if other.family in {known.family for known in fit.model.terms if known is not term}:
                     continue
-                rest = [*fit.model.terms[:number], *fit.model.terms[number + 1 :], other]
+                rest = [*fit.model.terms[:number], *fit.model.terms[number + 1 :]]
                 move = f"exchange {self._id(term)} for {self._id(other)}"
+                group = self._all(other, term)
                 if other.family == term.family:
-                    work = partial(fitted_in_form, fit, number, other)
+                    known = self.models.get(model_key(rest))
+                    less = None if known is None else known.fit
+                    work = partial(fitted_in_form, fit, number, group, self.settings.noise, less)
                 else:
-                    work = partial(fitted_exchanged, fit, number, self._all(other, term))
-                works.append((model_key(rest), move, work))
+                    work = partial(fitted_exchanged, fit, number, group)
+                works.append((model_key([*rest, other]), move, work))
         orders = in_other_orders(fit)
         works += [(model_key(o), "another order in series", partial(fitted_reordered, fit, o)) for o in orders]
         self._fit(works, fit, most)
