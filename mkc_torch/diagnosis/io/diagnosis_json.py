@@ -341,9 +341,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "plausible": f.plausible,
         "plausibility": f.plausibility,
         **({} if f.region is None else {"region": asdict(f.region)}),
-        **({"experiments": f.experiments} if f.experiments else {}),
-        **({"recordings": f.recordings} if f.recordings else {}),
-        **({"event_times": f.event_times} if f.event_times else {}),
+        **{key: value for key in ("experiments", "recordings", "event_times") if (value := getattr(f, key))},
         **({"references": [asdict(reference) for reference in f.references]} if f.references else {}),
         **({"advice": f.advice} if f.advice else {}),
     }
