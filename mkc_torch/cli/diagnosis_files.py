@@ -14,7 +14,6 @@ from mkc_torch._support.files import claim_folder, write_atomically
 from mkc_torch.cli.console import (
     FAILURES,
     ConsoleStyle,
-    Steps,
     folder_names,
     folder_written,
     remove_if_empty,
@@ -23,6 +22,7 @@ from mkc_torch.cli.console import (
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request, is_file_of_a_simulation
 from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.cli.recorded import read_magnetometer, read_table, refuse_no_magnetometer
+from mkc_torch.cli.steps import Steps
 from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.diagnosis.io.python_source import SourceError
 from mkc_torch.diagnosis.verdict import conclusion
@@ -139,13 +139,25 @@ class StageProgress:
 
     def __call__(self, stage: str) -> None:
         """Report the stage that begins."""
-        if self._step is not None:
+        if isinstance(self._step, Steps):
+            self._step.stage(self._subject, stage)
+        elif self._step is not None:
             self._step(f"{self._subject}: {stage}")
 
     def count(self, thing: str, done: int, total: int) -> None:
         """Report how many parts of the stage are done."""
         if isinstance(self._step, Steps):
             self._step.part(thing, done, total)
+
+    def bound(self, thing: str, done: int, most: int) -> None:
+        """Report how many parts of the stage are done before those that follow, and their largest number."""
+        if isinstance(self._step, Steps):
+            self._step.bound(thing, done, most)
+
+    def found(self, text: str) -> None:
+        """Report what was found so far."""
+        if isinstance(self._step, Steps):
+            self._step.found = text
 
 
 def write_diagnosis(

@@ -86,7 +86,8 @@ def diagnose(
         time_limit: seconds after which the search stops and returns what is known; ``stop`` lists what was not done.
             None for no limit.
         progress: called with the name of each stage as it begins. If it has a method ``count(thing, done, total)``,
-            that method is called with the progress within a stage, such as the number of fitted candidates.
+            that method is called with the progress within a stage, such as the number of fitted candidates. A method
+            ``found(text)`` is called with what was found so far.
 
     Returns:
         The diagnosis.

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 from mkc_torch._parallel.deadline import Reason, within
+from mkc_torch._parallel.progress import report_found
 from mkc_torch.diagnosis.evidence import TESTS
 from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceTest
 from mkc_torch.diagnosis.evidence.held_out import Evidence, blocks_of, on_all
@@ -21,6 +22,7 @@ from mkc_torch.diagnosis.optional import optional
 from mkc_torch.diagnosis.pipeline.build import DiagnosisInputs, build_diagnosis
 from mkc_torch.diagnosis.pipeline.prepare import Problem
 from mkc_torch.diagnosis.pipeline.search_notes import with_search_notes
+from mkc_torch.diagnosis.pipeline.so_far import found_so_far
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.result import Diagnosis, Stop
 from mkc_torch.diagnosis.search.run import SearchResult
@@ -57,8 +59,11 @@ class PartialResult:
         self._candidates = None
 
     def keep_search(self, search: StepwiseSearch) -> None:
-        """Store the search so far."""
+        """Store the search so far, and report its findings."""
         self.search = search
+        text = found_so_far(search, self.options.level)
+        if text:
+            report_found(text)
 
     def continued(
         self, step: str, work: Callable[[], StepwiseSearch], before: StepwiseSearch | None = None
@@ -186,6 +191,7 @@ def estimate(known: PartialResult, search: StepwiseSearch) -> EvidenceContext:
 
 def run_tests(known: PartialResult, search: StepwiseSearch, case: EvidenceContext) -> EvidenceReport:
     """The fifth stage: the tests of evidence, and the standard errors of the final parameters."""
+    known.problem.progress("running the tests of evidence")
     base = known.base
     parts = common_parts(base.model.prepared.open_loop(), known.candidates[1])
     return all_results(case, known.tests, [known.simulation, base, base.model, *parts, *search.parts])
@@ -193,6 +199,7 @@ def run_tests(known: PartialResult, search: StepwiseSearch, case: EvidenceContex
 
 def build_result(known: PartialResult, search: StepwiseSearch, evidence: EvidenceReport) -> Diagnosis:
     """The sixth stage: the verdict, the findings with their evidence, advice and warnings."""
+    known.problem.progress("describing the result")
     return known.diagnosis(search, evidence)
 
 

@@ -42,7 +42,7 @@ def stepwise_search(problem: Problem, known: PartialResult, baseline: ProcessNoi
     progress(f"trying {len(terms)} effects")
     lines = partial(line_candidates, drivers=known.candidates[0].drivers, effects=known.effects, options=options)
     if baseline.fit.model.prepared.dynamics is not None:
-        whole = partial(search_models, baseline, terms, options, generator, known.keep_search, lines)
+        whole = partial(search_models, baseline, terms, options, generator, known.keep_search, lines, progress)
         search = known.continued("searching models", whole)
         repeated = known.improved("halving the step of integration", partial(at_smaller_step, known, search), search)
         known.keep_search(repeated)
