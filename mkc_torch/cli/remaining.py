@@ -8,11 +8,11 @@ from collections.abc import Callable
 _FEWEST = 3
 """Items whose durations have to be known."""
 
-_BELOW, _ABOVE = 2.0, 3.0
-"""Ends of the range from the expected sum of the remaining durations, in its standard deviations.
+_BELOW = 2.0
+"""Standard deviations of the sum of the remaining durations by which the range begins below its expectation."""
 
-More above, because durations are skewed: a few fits take many times as long as the others.
-"""
+_ABOVE = 3.0
+"""Standard deviations by which it ends above: durations are skewed, a few fits take many times the others' time."""
 
 _MINUTES = 120.0
 """Seconds from which times are given in minutes."""
