@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from typing import Literal
 
 from mkc_torch._parallel.deadline import Reason, within
 from mkc_torch._parallel.progress import report_found
@@ -18,7 +20,7 @@ from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, first_samples
 from mkc_torch.diagnosis.model.shapes import candidates_of, within_a_sample
 from mkc_torch.diagnosis.model.term import Drivers, Term, common_parts
-from mkc_torch.diagnosis.optional import optional
+from mkc_torch.diagnosis.optional import failure, optional
 from mkc_torch.diagnosis.pipeline.build import DiagnosisInputs, build_diagnosis
 from mkc_torch.diagnosis.pipeline.prepare import Problem
 from mkc_torch.diagnosis.pipeline.search_notes import with_search_notes
@@ -217,7 +219,28 @@ def error_without_fit(reason: Reason, limit: float, where: str) -> BaseException
     )
 
 
-def cut_short(known: PartialResult, reason: Reason, seconds: float, limit: float) -> Diagnosis:
+def after_error(known: PartialResult, step: str, error: Exception, seconds: float) -> Diagnosis:
+    """Return the result of what is known after an internal error, with a warning that names the step.
+
+    Args:
+        known: the partial result, with the fit of the simulation.
+        step: name of the step.
+        error: that it ended in.
+        seconds: run time.
+
+    Raises:
+        Exception: the same error, if what is known cannot be described either.
+    """
+    try:
+        result = cut_short(known, "internal error", seconds)
+    except Exception:
+        raise error from None
+    return replace(result, warnings=(*result.warnings, failure(step, error)))
+
+
+def cut_short(
+    known: PartialResult, reason: Reason | Literal["internal error"], seconds: float, limit: float = math.inf
+) -> Diagnosis:
     """Return the result of what is known.
 
     Args:
@@ -229,6 +252,7 @@ def cut_short(known: PartialResult, reason: Reason, seconds: float, limit: float
         TimeoutError, KeyboardInterrupt: the first fit of the simulation had not ended.
     """
     if known.baseline is None:
+        assert reason != "internal error"
         raise error_without_fit(reason, limit, known.problem.where)
     known.problem.progress("writing down what is known")
     search = known.search if known.search is not None else _not_begun(known)
