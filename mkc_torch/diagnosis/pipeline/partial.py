@@ -61,8 +61,12 @@ class PartialResult:
         self._candidates = None
 
     def keep_search(self, search: StepwiseSearch) -> None:
-        """Store the search so far, and report its findings."""
+        """Store the search so far."""
         self.search = search
+
+    def keep_and_report(self, search: StepwiseSearch) -> None:
+        """Store the search so far, and report its findings."""
+        self.keep_search(search)
         text = found_so_far(search, self.options.level)
         if text:
             report_found(text)
