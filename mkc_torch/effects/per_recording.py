@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,12 @@ class PerRecording(Effect):
         effect: the effect with a common γ, for which :func:`can_differ` is True.
         recordings: names of the recordings, at least two.
         of_run: (K,), number of the recording of each run; None for a model without its recordings.
+        relative: whether γ is 0 in the first recording and a difference from it in the others, because a parameter of
+            the simulation acts as the effect with a common γ does.
+
+    Attributes:
+        sized: names of the recordings with a γ.
+        from_first: whether γ is a difference from the first recording.
 
     Example:
         >>> from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
@@ -44,12 +51,28 @@ class PerRecording(Effect):
         [-0.10000000149011612, -0.4000000059604645, -0.20000000298023224, -0.800000011920929]
     """
 
-    def __init__(self, effect: Effect, recordings: Sequence[str], of_run: Int[Tensor, " K"] | None = None) -> None:
-        self.effect, self.of_run = effect, of_run
+    def __init__(
+        self,
+        effect: Effect,
+        recordings: Sequence[str],
+        of_run: Int[Tensor, " K"] | None = None,
+        *,
+        relative: bool = False,
+    ) -> None:
+        self.effect, self.of_run, self.from_first = effect, of_run, relative
         for name in Effect.__annotations__:
             if name not in _NOT_COPIED:
                 setattr(self, name, getattr(effect, name))
         self.recordings = tuple(recordings)
+        self.sized = self.recordings[int(relative) :]
+        if relative:
+            self.lower = -math.inf  # a difference of sizes
+
+    def gamma_of(self, gamma: Float[Tensor, " q"], recording: str) -> Float[Tensor, " p"]:
+        """Return γ of the effect in one of the recordings."""
+        if recording not in self.sized:
+            return torch.zeros_like(gamma[:: len(self.sized)])
+        return gamma[self.sized.index(recording) :: len(self.sized)]
 
     @property
     def first_runs(self) -> list[int]:
@@ -62,9 +85,9 @@ class PerRecording(Effect):
         return self.effect.display_name
 
     @property
-    def simpler(self) -> Effect:
-        """The effect with a common γ."""
-        return self.effect
+    def simpler(self) -> Effect | None:
+        """The effect with a common γ; None where a parameter of the simulation acts as that does."""
+        return None if self.from_first else self.effect
 
     @property
     def has_basis(self) -> bool:
@@ -90,7 +113,8 @@ class PerRecording(Effect):
         return self.effect.bind(shape, context)
 
     def equation_of(self, shape: Shape, context: Context) -> str:
-        return f"{self.effect.equation_of(shape, context)},  with a γ for each recording"
+        but = f" but {self.recordings[0]}" if self.from_first else ""
+        return f"{self.effect.equation_of(shape, context)},  with a γ for each recording{but}"
 
     def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
         return self.effect.explained(self._mean(gamma), shape, context)
@@ -100,12 +124,12 @@ class PerRecording(Effect):
         return f"{plain} Find what changed between the recordings, and give each its own size."
 
     def _mean(self, gamma: Sequence[float]) -> list[float]:
-        k = len(self.recordings)
+        k = len(self.sized)
         return [sum(gamma[first : first + k]) / k for first in range(0, len(gamma), k)]
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         each = self.effect.quantities(shape, context)
-        return tuple(quantity._replace(size=quantity.size * len(self.recordings)) for quantity in each)
+        return tuple(quantity._replace(size=quantity.size * len(self.sized)) for quantity in each)
 
     def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:
         known = {each.name: each.size for each in self.effect.quantities(shape, context)}
@@ -114,10 +138,10 @@ class PerRecording(Effect):
             labels = tuple(context.channels)
         if not labels:
             labels = tuple(map(str, range(1, known[quantity] + 1))) if known[quantity] > 1 else ("",)
-        return tuple(f"{label} in {name}" if label else name for label in labels for name in self.recordings)
+        return tuple(f"{label} in {name}" if label else name for label in labels for name in self.sized)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        k = len(self.recordings)
+        k = len(self.sized)
         total: Tensor | None = None
         for number, there in enumerate(self._members(context)):
             own = torch.cat([gamma[j : j + 1] for j in range(number, len(gamma), k)])
@@ -139,18 +163,19 @@ class PerRecording(Effect):
         return (plain.unsqueeze(-1) * there[:, None, None, :]).flatten(-2)
 
     def _members(self, context: Context) -> list[Float[Tensor, " N"]]:
-        """1 at the moments of each recording, else 0."""
+        """1 at the moments of each recording with a γ, else 0."""
         if self.of_run is None:
             raise ValueError(
                 f"Expected the recording to have a known {self.display_name}, which differs between "
                 f"{' and '.join(self.recordings)}; select one of them."
             )
         recording = self.of_run[context.runs]
-        return [(recording == number).to(context.time.dtype) for number in range(len(self.recordings))]
+        numbers = range(int(self.from_first), len(self.recordings))
+        return [(recording == number).to(context.time.dtype) for number in numbers]
 
     def code(self, gamma: Sequence[float], shape: Shape, names: Mapping[str, str]) -> tuple[str, ...]:
-        k = len(self.recordings)
-        each = [dict(zip(self.recordings, gamma[j : j + k], strict=True)) for j in range(0, len(gamma), k)]
+        k, none = len(self.sized), dict.fromkeys(self.recordings, 0.0)
+        each = [none | dict(zip(self.sized, gamma[j : j + k], strict=True)) for j in range(0, len(gamma), k)]
         sizes: Any = [_Selected(known) for known in each]
         return self.effect.code(sizes, shape, names)
 
@@ -187,6 +212,11 @@ def selected_size(system: object, sizes: Mapping[str, float]) -> float:
             f"{' or '.join(map(repr, sizes))} (`--sizes-of`), not {name!r}."
         )
     return sizes[name]
+
+
+def is_relative(effect: Effect) -> bool:
+    """Whether an effect has a γ relative to that in the first of several recordings."""
+    return isinstance(effect, PerRecording) and effect.from_first
 
 
 def can_differ(effect: Effect) -> bool:

@@ -25,7 +25,7 @@ from mkc_torch.effects import CATALOGUE
 from mkc_torch.recording.recording import write_table
 from mkc_torch.simulation import load_simulation
 from tests.cli.commands import assert_refused, flat, mkc
-from tests.diagnosis.vehicle import MASS, Pendulum, Vehicle, coast_down, swing
+from tests.diagnosis.vehicle import MASS, DraggedVehicle, Pendulum, Vehicle, coast_down, swing
 
 SOURCE = f"from mkc_torch.simulation import Dynamics, Parameter\n\nMASS = {MASS}\n\n\n{inspect.getsource(Vehicle)}"
 
@@ -177,6 +177,26 @@ def test_equal_drag_has_a_common_size():
     assert all("per_recording" not in alternative.effect for alternative in finding.alternatives)
     (content,) = json.loads(diagnosis_to_json(diagnosis))["findings"]
     assert "recordings" not in content
+
+
+@pytest.mark.e2e
+def test_a_difference_from_a_common_parameter_of_the_simulation_is_named():
+    recordings = vehicles((0.0067, 0.020), 1)
+    diagnosis = diagnose(DraggedVehicle(), recordings, input_hold={"force": "held"}, surrogates=19)
+    (finding,) = diagnosis.findings
+    assert (finding.effect, finding.recordings) == ("quadratic_drag", ("A", "B"))
+    (drag,) = finding.parameters
+    assert drag.components == ("B",)
+    assert abs(drag.value - (0.020 - 0.0067)) <= 3.0 * drag.standard_error
+    assert "in B, relative to A, where the simulation's own parameters hold." in finding.explanation
+    assert json.loads(diagnosis_to_json(diagnosis))["findings"][0]["recordings"] == ["A", "B"]
+    model = DiagnosedModel.from_json(diagnosis.model.to_json(), simulation=DraggedVehicle())
+    for number, recording in enumerate(recordings):
+        simulated, _ = model.with_sizes_of(recording.name).correct(recording)
+        residuals = [float((simulated["speed"] - other["speed"]).square().mean().sqrt()) for other in recordings]
+        assert residuals[number] < 0.1  # the noise is 0.05 m/s
+    equal = diagnose(DraggedVehicle(), vehicles((0.010, 0.010), 2), input_hold={"force": "held"}, surrogates=19)
+    assert (equal.verdict, equal.findings) == ("adequate", ())
 
 
 @pytest.mark.e2e

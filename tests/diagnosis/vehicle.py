@@ -20,6 +20,15 @@ class Vehicle(Dynamics):
         return {"speed": u.force / p.mass - p.rolling}
 
 
+class DraggedVehicle(Vehicle):
+    """The same with a common air drag."""
+
+    parameters = {**Vehicle.parameters, "drag": Parameter(0.01, lower=0.0)}
+
+    def derivative(self, time, x, u, p):
+        return {"speed": u.force / p.mass - p.rolling - p.drag * x.speed * x.speed.abs()}
+
+
 class Pendulum(Dynamics):
     """A damped pendulum on a motor, without dry friction."""
 

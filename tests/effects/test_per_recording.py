@@ -38,6 +38,16 @@ class TestEveryEffectWhoseSizeCanDiffer:
         of_second = (RUNS[context.run] == 1).unsqueeze(-1)
         torch.testing.assert_close(found, torch.where(of_second, parts[1], parts[0]))
 
+    def test_a_difference_from_the_first_recording_changes_the_others_only(self, effect, shape, context):
+        gamma = random_gammas(1, size_of(effect, shape, context))[0]
+        form = PerRecording(effect, NAMES, RUNS, relative=True)
+        found = form.change(gamma, shape, context)
+        of_second = (RUNS[context.run] == 1).unsqueeze(-1)
+        plain = effect.change(gamma, shape, context)
+        torch.testing.assert_close(found, torch.where(of_second, plain, torch.zeros_like(plain)))
+        assert torch.equal(form.gamma_of(gamma, "b"), gamma)
+        assert torch.equal(form.gamma_of(gamma, "a"), torch.zeros_like(gamma))
+
     def test_the_basis_gives_the_change(self, effect, shape, context):
         form = PerRecording(effect, NAMES, RUNS)
         whole, _ = gammas(effect, shape, context)

@@ -26,6 +26,7 @@ from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE
 from mkc_torch.effects.context import Context
 from mkc_torch.effects.kinds import kind_at
+from mkc_torch.effects.per_recording import is_relative
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
@@ -234,7 +235,7 @@ def parameters_of(
 
 def _components(term: Term, quantity: str, size: int, context: Context) -> tuple[str, ...]:
     """Return the component names of a quantity: those of the effect, or the channels."""
-    if size < 2:
+    if size < 2 and not is_relative(term.effect):
         return ()
     own = term.effect.components(quantity, term.shape, context)
     return own or (tuple(context.channels) if size == len(context.channels) else ())

@@ -24,17 +24,21 @@ def differing_sizes(parameters: Sequence[EffectParameter], recordings: Sequence[
     """
     if not recordings:
         return ()
-    return tuple(_sentence(parameter) for parameter in parameters if len(parameter.components) >= len(recordings))
+    return tuple(_sentence(parameter, recordings[0]) for parameter in parameters if parameter.components)
 
 
-def _sentence(parameter: EffectParameter) -> str:
-    assert isinstance(parameter.value, tuple)
-    errors = parameter.standard_error if isinstance(parameter.standard_error, tuple) else ()
+def _sentence(parameter: EffectParameter, first: str) -> str:
+    value, error = parameter.value, parameter.standard_error
+    values = value if isinstance(value, tuple) else (value,)
+    errors = error if isinstance(error, tuple) else (error,)
     sizes = []
-    for number, (value, name) in enumerate(zip(parameter.value, parameter.components, strict=True)):
+    for number, (value, name) in enumerate(zip(values, parameter.components, strict=True)):
         error = errors[number] if number < len(errors) else None
         sizes.append(f"{_with_error(value, error)} {parameter.unit}".rstrip() + f" in {name}")
-    return f"The {parameter.name.replace('_', ' ')} differs between the recordings: {', '.join(sizes)}."
+    text = f"The {parameter.name.replace('_', ' ')} differs between the recordings: {', '.join(sizes)}"
+    if any(name.endswith(first) for name in parameter.components):
+        return f"{text}."
+    return f"{text}, relative to {first}, where the simulation's own parameters hold."
 
 
 def _with_error(value: object, error: object) -> str:

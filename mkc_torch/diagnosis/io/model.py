@@ -23,7 +23,7 @@ from mkc_torch.diagnosis.result import CorrectingModel
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context
-from mkc_torch.effects.per_recording import PerRecording
+from mkc_torch.effects.per_recording import PerRecording, is_relative
 from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
 from mkc_torch.recording.recording import MissingColumnError, Recording
 from mkc_torch.simulation.dynamics import Dynamics
@@ -208,6 +208,7 @@ class DiagnosedModel(CorrectingModel):
                 **({"port": term.at} if term.at else {}),
                 **({"first": True} if term.first else {}),
                 **({"recordings": list(term.effect.recordings)} if term.effect.recordings else {}),
+                **({"relative": True} if is_relative(term.effect) else {}),
                 "parameters": gamma.tolist(),
                 "equation": term.effect.equation,
             }
@@ -326,7 +327,7 @@ def _read(content: Mapping[str, Any], known: Sequence[Effect], simulation: Simul
         shape = {name: _finite(value) for name, value in entry["shape"].items()}
         effect = _effect(entry, known)
         if "recordings" in entry:
-            effect = PerRecording(effect, tuple(map(str, entry["recordings"])))
+            effect = PerRecording(effect, entry["recordings"], relative=entry.get("relative", False))
         terms.append(Term(effect, driver, shape, entry.get("port", ""), entry.get("first", False)))
         gammas.append(_vector(entry["parameters"]))
     known_fit = Training.from_dict(content["training"]) if "training" in content else None

@@ -43,18 +43,18 @@ def selected(
             f"Expected one of the diagnosed recordings, {' or '.join(map(repr, known))}, but got {name!r}; give the "
             "recording whose sizes apply (`--sizes-of`)."
         )
-    number, found, sizes = known.index(name), [], []
+    found, sizes = [], []
     for term, gamma in zip(terms, gammas, strict=True):
-        own = isinstance(term.effect, PerRecording)
-        found.append(replace(term, effect=term.effect.effect) if isinstance(term.effect, PerRecording) else term)
-        sizes.append(gamma[number :: len(known)] if own else gamma)
+        own = term.effect
+        found.append(replace(term, effect=own.effect) if isinstance(own, PerRecording) else term)
+        sizes.append(own.gamma_of(gamma, name) if isinstance(own, PerRecording) else gamma)
     return found, sizes
 
 
 def without_runs(terms: Sequence[Term]) -> list[Term]:
     """Return effects without the assignment of runs to recordings, which holds for those of the fit only."""
     return [
-        replace(term, effect=PerRecording(term.effect.effect, term.effect.recordings))
+        replace(term, effect=PerRecording(term.effect.effect, term.effect.recordings, relative=term.effect.from_first))
         if isinstance(term.effect, PerRecording)
         else term
         for term in terms

@@ -27,6 +27,7 @@ from mkc_torch.diagnosis.pipeline.search_notes import with_search_notes
 from mkc_torch.diagnosis.pipeline.so_far import found_so_far
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.result import Diagnosis, Stop
+from mkc_torch.diagnosis.search.moves import with_references
 from mkc_torch.diagnosis.search.run import SearchResult
 
 
@@ -125,7 +126,10 @@ class PartialResult:
         """The recorded columns that can drive an effect, and the candidates."""
         if self._candidates is None:
             prepared, settings = self.base.model.prepared.open_loop(), self.options.settings
-            self._candidates = candidates_of(self.simulation, prepared, self.effects, settings.drivers)
+            drivers, terms = candidates_of(self.simulation, prepared, self.effects, settings.drivers)
+            free = self.fitted_baseline.free
+            alone = self.base if free is None else free
+            self._candidates = drivers, with_references(alone, terms, settings.noise)
         return self._candidates
 
     def open_loop_findings(self, search: StepwiseSearch) -> OpenLoop:

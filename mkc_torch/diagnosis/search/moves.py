@@ -15,6 +15,7 @@ from mkc_torch.diagnosis.model.shapes import reach_of, within_a_sample
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import NoiseSettings
+from mkc_torch.effects.per_recording import PerRecording, is_relative
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
@@ -124,6 +125,30 @@ def additions(fit: FittedModel, terms: Sequence[Term], settings: NoiseSettings) 
     return sorted(found, key=lambda addition: -addition.gain)
 
 
+def with_references(fit: FittedModel, terms: Sequence[Term], settings: NoiseSettings) -> tuple[Term, ...]:
+    """Return candidates with sizes relative to the first recording where a parameter acts as a common size does.
+
+    Args:
+        fit: the simulation alone.
+        terms: candidates with a common size and with a size for each recording.
+        settings: which samples count.
+    """
+    families = {term.family for term in terms if term.effect.recordings}
+    common = {term.family: term for term in terms if term.family in families and not term.effect.recordings}
+    if not common:
+        return tuple(terms)
+    gains, _ = linear_gains(fit, list(common.values()), settings)
+    same = {family for family, gain in zip(common, gains, strict=True) if gain == -math.inf}
+    forms: dict[int, PerRecording] = {}
+    for term in terms:
+        if term.family in same and isinstance(own := term.effect, PerRecording):
+            forms.setdefault(id(own), PerRecording(own.effect, own.recordings, own.of_run, relative=True))
+    return tuple(
+        replace(term, effect=forms[id(term.effect)]) if term.family in same and id(term.effect) in forms else term
+        for term in terms
+    )
+
+
 def at_size_zero(fit: FittedModel, group: Sequence[Term]) -> Addition:
     """Return an effect to add from size 0, at the first shapes of its grid."""
     zero = fit.parameters.new_zeros(fit.model.with_term(group[0]).size - fit.model.size)
@@ -219,7 +244,9 @@ def special_cases(term: Term, terms: Sequence[Term], prepared: PreparedSimulatio
         )
         if comes_by_exchange(term) and comes_by_exchange(other) and other.effect.id != term.effect.id:
             nested = nested or _special_id(other) == _special_id(term)
-        nested = nested or (other.family == term.family and other.key != term.key)
+        forms = other.family == term.family and other.key != term.key
+        # relative to a parameter of the simulation, which acts as the common size does
+        nested = nested or (forms and not (is_relative(term.effect) or is_relative(other.effect)))
         alike = other.columns == term.columns or not (other.columns and term.columns)
         if nested and prepared.ports[other.port].channels == channels and alike:
             found.append(other)
@@ -253,7 +280,7 @@ def one_form_each(found: Sequence[Addition], worth: Callable[[Addition], float])
         families.setdefault((special.id if special else term.effect.id, *term.key[1:]), []).append(addition)
     chosen = []
     for key, members in families.items():
-        first = [addition for addition in members if addition.key == key]
+        first = [a for a in members if a.key == key] or [a for a in members if is_relative(a.starts[0][0].effect)]
         if first:
             best = max(members, key=worth)
             chosen.append(best if worth(best) > worth(first[0]) + _BETTER else first[0])
