@@ -1,4 +1,4 @@
-"""Progress of long work: how many items of a stage are done."""
+"""Progress of long work: how many items of a stage are done, and what was found so far."""
 
 from __future__ import annotations
 
@@ -18,13 +18,29 @@ class Counter(Protocol):
         """Receive that ``done`` of ``total`` items are done; ``thing`` is the name of an item, such as "candidate"."""
 
 
-_counter: ContextVar[Counter | None] = ContextVar("counter", default=None)
+@runtime_checkable
+class BoundReceiver(Protocol):
+    """A receiver of the largest number of items of a stage."""
+
+    def bound(self, thing: str, done: int, most: int) -> object:
+        """Receive that ``done`` items of at most ``most`` are done before the items that are counted next."""
+
+
+@runtime_checkable
+class FindingReceiver(Protocol):
+    """A receiver of what was found so far."""
+
+    def found(self, text: str) -> object:
+        """Receive what was found so far, in words."""
+
+
+_counter: ContextVar[object] = ContextVar("counter", default=None)
 
 
 @contextmanager
 def counting(counter: object) -> Iterator[None]:
-    """Send the counts within the block to ``counter`` if it is a :class:`Counter`; otherwise discard them."""
-    token = _counter.set(counter if isinstance(counter, Counter) else None)
+    """Send the progress within the block to the methods that ``counter`` has, of the protocols of this module."""
+    token = _counter.set(counter)
     try:
         yield
     finally:
@@ -41,8 +57,22 @@ def silently() -> Iterator[None]:
 def count(thing: str, done: int, total: int) -> None:
     """Report that ``done`` of ``total`` items are done, unless ``thing`` is empty or there is only one item."""
     counter = _counter.get()
-    if counter is not None and thing and total > 1:
+    if isinstance(counter, Counter) and thing and total > 1:
         counter.count(thing, done, total)
+
+
+def report_bound(thing: str, done: int, most: int) -> None:
+    """Report that ``done`` items of at most ``most`` are done before the items that are counted next."""
+    receiver = _counter.get()
+    if isinstance(receiver, BoundReceiver):
+        receiver.bound(thing, done, most)
+
+
+def report_found(text: str) -> None:
+    """Report what was found so far, in words."""
+    receiver = _counter.get()
+    if isinstance(receiver, FindingReceiver):
+        receiver.found(text)
 
 
 def counted(things: Iterable[T], total: int, thing: str, done: int = 0) -> Iterator[T]:

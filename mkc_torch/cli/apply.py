@@ -10,6 +10,7 @@ import typer
 from mkc_torch.cli.console import FAILURES, complain, interrupts_reported, parsed_columns, progress
 from mkc_torch.cli.diagnosis_request import SIMULATIONS
 from mkc_torch.cli.loading import loading
+from mkc_torch.cli.simulation_option import SIZES_OF_HELP
 from mkc_torch.cli.units_option import CONVERT_HELP, CONVERT_METAVAR, LABEL_HELP, SENSOR_HELP, parsed_units
 
 
@@ -38,6 +39,7 @@ def apply(
     convert: Annotated[list[str] | None, typer.Option(metavar=CONVERT_METAVAR, help=CONVERT_HELP)] = None,
     unit_label: Annotated[str | None, typer.Option(metavar="UNIT", help=LABEL_HELP)] = None,
     sensor: Annotated[str | None, typer.Option(metavar="NAME", help=SENSOR_HELP)] = None,
+    sizes_of: Annotated[str | None, typer.Option(metavar="RECORDING", help=SIZES_OF_HELP)] = None,
     ros: Annotated[
         bool,
         typer.Option("--ros", help="Write the fields of ROS's sensor_msgs/MagneticField: tesla, and a covariance."),
@@ -61,6 +63,7 @@ def apply(
             read_correction,
             show_correction,
             unit_of,
+            with_sizes_of,
             write_correction,
         )
         from mkc_torch.cli.diagnosis_files import named_simulation, paired_simulation
@@ -75,7 +78,7 @@ def apply(
                 subject = str(simulation or simulator_output)
                 own = named_simulation(simulation) if simulation else paired_simulation(Path(subject), names)
             subject = model
-            known = read_correction(model, own)
+            known = with_sizes_of(read_correction(model, own), sizes_of)
             subject = output
             _refuse_input(output, recording, model, simulator_output)
             subject = recording

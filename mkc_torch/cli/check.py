@@ -28,6 +28,7 @@ from mkc_torch.cli.simulation_option import (
     INPUT_HOLD_HELP,
     OWN_SIMULATION,
     RUN_COLUMN_HELP,
+    SIZES_OF_HELP,
     checked_columns,
     checked_input_hold,
     checked_sensor,
@@ -66,6 +67,7 @@ def check(
             "enough, at least a tenth.",
         ),
     ] = None,
+    sizes_of: Annotated[str | None, typer.Option(metavar="RECORDING", help=SIZES_OF_HELP)] = None,
     junit: Annotated[
         Path | None, typer.Option(metavar="FILE.xml", help="Also write the results as JUnit XML, for a build server.")
     ] = None,
@@ -99,7 +101,7 @@ def check(
     left, checked = list(recordings), []
     with interrupts_reported(lambda: not_written(left, output)), progress(len(recordings), lines=True) as step:
         try:
-            known, request = model_of(model, request)
+            known, request = model_of(model, request, sizes_of)
         except FAILURES as error:
             complain(model, error)
             raise typer.Exit(1) from None

@@ -9,10 +9,11 @@ from pathlib import Path
 from mkc_torch._support.files import claim_folder, write_atomically
 from mkc_torch.calibration.result import SCHEMA as CALIBRATION
 from mkc_torch.cli.console import folder_written
-from mkc_torch.cli.correction import read_correction
+from mkc_torch.cli.correction import read_correction, with_sizes_of
 from mkc_torch.cli.diagnosis_files import failure_sentence, read_recording, simulation_of
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Request, is_file_of_a_simulation
 from mkc_torch.diagnosis import DiagnosedModel, RecordingCheck, check
+from mkc_torch.diagnosis.io.selected_sizes import refuse_unselected
 from mkc_torch.report.check.page import check_report
 from mkc_torch.simulation.load import raised_in
 
@@ -41,18 +42,25 @@ class CheckedFile:
         return self.check is not None and self.check.holds
 
 
-def model_of(path: Path, request: Request) -> tuple[DiagnosedModel, Request]:
+def model_of(path: Path, request: Request, sizes_of: str | None = None) -> tuple[DiagnosedModel, Request]:
     """Read a model with its simulation. Returns it with the request, whose simulation is set for a magnetometer.
 
+    Args:
+        path: the model.
+        request: the options.
+        sizes_of: diagnosed recording whose sizes apply, where sizes differ between recordings.
+
     Raises:
-        ValueError, OSError: the file is not a model, its simulation is not given, or another one.
+        ValueError, OSError: the file is not a model, its simulation is not given, or another one; or no recording is
+            given whose sizes apply.
     """
     own = None
     if not request.undecided and request.simulation != MAGNETOMETER:
         own = simulation_of(request)
     _refuse_calibration(path)
-    known = read_correction(path, own)
+    known = with_sizes_of(read_correction(path, own), sizes_of)
     assert isinstance(known, DiagnosedModel)
+    refuse_unselected(known.terms)
     return known, replace(request, simulation=MAGNETOMETER) if own is None else request
 
 

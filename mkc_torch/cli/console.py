@@ -4,33 +4,31 @@ from __future__ import annotations
 
 import io
 import json
-import math
-import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
-from threading import Event, RLock, Thread
+from threading import Event, Thread
 from time import monotonic
 
 import typer
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    ProgressColumn,
     SpinnerColumn,
-    Task,
     TextColumn,
     TimeElapsedColumn,
 )
 from rich.text import Text
 
 from mkc_torch._support.files import folder_held
+from mkc_torch.cli.steps import Steps, drawing
 
 FAILURES = (ValueError, OSError, ImportError, RuntimeError)
 """Errors of bad input, a full disk or a numerical breakdown."""
@@ -180,91 +178,14 @@ def folder_names(labels: list[str]) -> list[str]:
     return names
 
 
-class Steps:
-    """Progress of a command, shown as a bar on a terminal.
-
-    Attributes:
-        name: the current item.
-        done, total: number of finished items, and of all.
-    """
-
-    def __init__(self, bar: Progress | None, total: int) -> None:
-        self.name, self.done, self.total = "", 0, total
-        self._bar = bar
-        self._task = None if bar is None else bar.add_task("", total=total)
-        self._part: tuple[str, int, int] | None = None
-        self._timed = None if bar is None else bar.add_task("", total=None, visible=False)
-
-    def __call__(self, name: str | None) -> None:
-        """Report the name of an item that begins, or None when it is done."""
-        if name is None:
-            self.done += 1
-        else:
-            self.name = name
-        self._part = None
-        if self._bar is None or self._task is None:
-            return
-        if name is None:
-            self._bar.advance(self._task)
-        else:
-            self._bar.update(self._task, description=name)
-
-    def part(self, thing: str, done: int, total: int) -> None:
-        """Report how many parts of the current stage are done."""
-        known = self._part
-        self._part = thing, done, total
-        if self._bar is None or self._timed is None:
-            return
-        if known is None or (known[0], known[2]) != (thing, total) or done < known[1]:
-            self._bar.reset(self._timed, total=total, completed=done, visible=False)
-        else:
-            self._bar.update(self._timed, completed=done)
-
-    @property
-    def on_a_terminal(self) -> bool:
-        """Whether a progress bar is shown."""
-        return self._bar is not None
-
-    @property
-    def part_done(self) -> str:
-        """Return the current part, the number of parts, and the remaining time at the rate so far."""
-        if self._part is None or self._part[1] >= self._part[2]:
-            return ""
-        thing, done, total = self._part
-        task = None if self._bar is None else next(task for task in self._bar.tasks if task.id == self._timed)
-        if task is None or task.time_remaining is None:
-            return f"{thing} {done + 1} of {total}"
-        return f"{thing} {done + 1} of {total}, about {math.ceil(task.time_remaining)} s"
-
-    def count(self, name: str, done: int, total: int) -> None:
-        """Report the current item and the number of finished items."""
-        self.name, self.done, self.total = name, done, total
-        if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, description=name, completed=done, total=total)
-
-    @contextmanager
-    def aside(self) -> Iterator[None]:
-        """Hide the bar while other text is printed."""
-        if self._bar is None:
-            yield
-            return
-        with drawing:
-            self._bar.stop()
-            yield
-            self._bar.start()
-
-
-drawing = RLock()
-"""Held while drawing and while forking, so that a forked process inherits no locked console."""
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=drawing.acquire, after_in_parent=drawing.release, after_in_child=drawing.release)
-
 _REFRESH_S = 0.2
 """Seconds between refreshes of the bar."""
 
 _LINE_S = 10.0
-"""Seconds between lines of progress in a pipe."""
+"""Seconds between the first lines of progress in a pipe."""
+
+_SPARSE = 0.25
+"""Pause between later lines in a pipe, over the time since the start: ten minutes have about 20 lines."""
 
 _FIRST_LINE_S = 3.0
 """Seconds until the first line of progress in a pipe."""
@@ -282,15 +203,24 @@ def progress(total: int, folder: Path | None = None, *, lines: bool = False) -> 
     Args:
         total: number of items.
         folder: folder of ``progress.txt``.
-        lines: if standard error is not a terminal, write the stage to it after three seconds, then every ten seconds.
+        lines: if standard error is not a terminal, write the stage to it after three seconds, then after ten, and
+            more rarely later.
     """
     begin = monotonic()
     with _shown(total) as steps, ExitStack() as threads:
         if folder is not None:
             threads.enter_context(_repeated(lambda: _note(steps, folder, monotonic() - begin), _FILE_LINE_S))
         if lines and not steps.on_a_terminal:
-            threads.enter_context(_repeated(lambda: _write_line(steps, monotonic() - begin), _LINE_S, _FIRST_LINE_S))
+            pause = partial(_pause_between_lines, begin)
+            threads.enter_context(
+                _repeated(lambda: _write_line(steps, monotonic() - begin), _LINE_S, _FIRST_LINE_S, pause)
+            )
         yield steps
+
+
+def _pause_between_lines(begin: float) -> float:
+    """Return the pause in s until the next line, for work that began at ``begin``."""
+    return max(_LINE_S, _SPARSE * (monotonic() - begin))
 
 
 def _write_line(steps: Steps, elapsed: float) -> None:
@@ -300,9 +230,10 @@ def _write_line(steps: Steps, elapsed: float) -> None:
 
 
 def _stage(steps: Steps) -> str:
-    """Return the number of finished items, the current item and its part."""
+    """Return the number of finished items, the current item, what was found so far, and the current part."""
     count = f"{steps.done} of {steps.total} done, " if steps.total > 1 else ""
-    return count + "; ".join(filter(None, [steps.name, steps.part_done]))
+    found = steps.found and f"so far: {steps.found}"
+    return count + "; ".join(filter(None, [steps.name, found, steps.part_done]))
 
 
 def _note(steps: Steps, folder: Path, elapsed: float) -> None:
@@ -320,31 +251,41 @@ def _shown(total: int) -> Iterator[Steps]:
         yield Steps(None, total)
         return
     over = (BarColumn(), MofNCompleteColumn()) if total > 1 else ()
-    part = _PartColumn()
-    parts = (SpinnerColumn(), TextColumn("{task.description}", markup=False), part, *over, TimeElapsedColumn())
+    parts = (SpinnerColumn(), TextColumn("{task.description}", markup=False), *over, TimeElapsedColumn())
     with (
-        Progress(
+        _BarWithLines(
             *parts, console=console, transient=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False
         ) as bar,
         _repeated(lambda: bar.refresh() if bar.live.is_started else None, _REFRESH_S),
     ):
-        part.steps = Steps(bar, total)
-        yield part.steps
+        bar.steps = Steps(bar, total)
+        yield bar.steps
 
 
-class _PartColumn(ProgressColumn):
-    """Column with the part of the stage that is being done."""
+class _BarWithLines(Progress):
+    """A progress bar with lines of text below it."""
 
     steps: Steps | None = None
 
-    def render(self, task: Task) -> Text:  # noqa: ARG002 - signature of rich
-        """Return the current text."""
-        return Text("" if self.steps is None else self.steps.part_done)
+    def get_renderables(self) -> Iterator[RenderableType]:
+        """Yield the bar and the lines."""
+        yield from super().get_renderables()
+        if self.steps is not None:
+            yield from (Text(f"  {line}", no_wrap=True, overflow="ellipsis") for line in self.steps.lines)
 
 
 @contextmanager
-def _repeated(work: Callable[[], None], every: float, first: float | None = None) -> Iterator[None]:
-    """Call ``work`` repeatedly in a thread, every so many seconds, the first time after ``first`` if it is given."""
+def _repeated(
+    work: Callable[[], None], every: float, first: float | None = None, later: Callable[[], float] | None = None
+) -> Iterator[None]:
+    """Call ``work`` repeatedly in a thread.
+
+    Args:
+        work: the function.
+        every: pause in s.
+        first: pause in s before the first call, if it is another.
+        later: returns the pauses in s after the first call; None for ``every``.
+    """
     over = Event()
 
     def repeat() -> None:
@@ -352,7 +293,7 @@ def _repeated(work: Callable[[], None], every: float, first: float | None = None
         while not over.wait(pause):
             with drawing:
                 work()
-            pause = every
+            pause = every if later is None else later()
 
     thread = Thread(target=repeat, daemon=True)
     thread.start()

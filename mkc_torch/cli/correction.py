@@ -153,6 +153,19 @@ def read_correction(path: Path, simulation: Simulation | None = None) -> Calibra
     raise ValueError(f"this is neither a calibration nor a model: its schema is {found}; {_GIVE}.")
 
 
+def with_sizes_of(known: Calibration | DiagnosedModel, recording: str | None) -> Calibration | DiagnosedModel:
+    """Return the model with the sizes of a diagnosed recording; unchanged without one.
+
+    Raises:
+        ValueError: a calibration, or a model whose sizes do not differ between recordings, or not with this name.
+    """
+    if recording is None:
+        return known
+    if isinstance(known, Calibration):
+        raise ValueError("a calibration has no sizes of recordings; leave out --sizes-of.")
+    return known.with_sizes_of(recording)
+
+
 def correct(known: Calibration | DiagnosedModel, recording: Recording) -> Corrected:
     """Correct a recording with a calibration or a model.
 

@@ -79,7 +79,7 @@ def diagnose_simulated(folder: Path, *, force: bool) -> tuple[Diagnosis, list[Pa
     recording = concealed_recording()
     diagnosis = diagnose(Magnetometer(), recording)
     write_table(folder / "concealed.csv", recording.columns, overwrite=force)
-    files = write_diagnosis(diagnosis, folder / CONCEALED, force=force, note=_CONCEALED_NOTE)
+    _, files = write_diagnosis(diagnosis, folder / CONCEALED, force=force, note=_CONCEALED_NOTE)
     return diagnosis, [folder / "concealed.csv", *files]
 
 

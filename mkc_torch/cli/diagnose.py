@@ -15,7 +15,6 @@ from mkc_torch.cli.console import (
     DOUBTFUL,
     FAILURES,
     ConsoleStyle,
-    Steps,
     complain,
     err,
     interrupts_reported,
@@ -48,6 +47,7 @@ from mkc_torch.cli.simulation_option import (
     checked_simulation,
     checked_units,
 )
+from mkc_torch.cli.steps import Steps
 from mkc_torch.cli.units_option import (
     CONVERT_HELP,
     CONVERT_METAVAR,

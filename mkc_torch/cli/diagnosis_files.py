@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +14,6 @@ from mkc_torch._support.files import claim_folder, write_atomically
 from mkc_torch.cli.console import (
     FAILURES,
     ConsoleStyle,
-    Steps,
     folder_names,
     folder_written,
     remove_if_empty,
@@ -23,8 +22,10 @@ from mkc_torch.cli.console import (
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request, is_file_of_a_simulation
 from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.cli.recorded import read_magnetometer, read_table, refuse_no_magnetometer
+from mkc_torch.cli.steps import Steps
 from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.diagnosis.io.python_source import SourceError
+from mkc_torch.diagnosis.optional import failure
 from mkc_torch.diagnosis.verdict import conclusion
 from mkc_torch.recording.column_names import split_unit
 from mkc_torch.recording.join_recordings import joint_name
@@ -139,13 +140,25 @@ class StageProgress:
 
     def __call__(self, stage: str) -> None:
         """Report the stage that begins."""
-        if self._step is not None:
+        if isinstance(self._step, Steps):
+            self._step.stage(self._subject, stage)
+        elif self._step is not None:
             self._step(f"{self._subject}: {stage}")
 
     def count(self, thing: str, done: int, total: int) -> None:
         """Report how many parts of the stage are done."""
         if isinstance(self._step, Steps):
             self._step.part(thing, done, total)
+
+    def bound(self, thing: str, done: int, most: int) -> None:
+        """Report how many parts of the stage are done before those that follow, and their largest number."""
+        if isinstance(self._step, Steps):
+            self._step.bound(thing, done, most)
+
+    def found(self, text: str) -> None:
+        """Report what was found so far."""
+        if isinstance(self._step, Steps):
+            self._step.found = text
 
 
 def write_diagnosis(
@@ -156,26 +169,50 @@ def write_diagnosis(
     report: bool = True,
     note: str = "",
     paths: RunPaths | None = None,
-) -> list[Path]:
+) -> tuple[Diagnosis, list[Path]]:
     """Write diagnosis.json, model.json and report.html into a folder.
 
-    Differential equations also get corrected.py, the simulation with the findings. ``note`` is shown in the report.
+    Differential equations also get corrected.py, the simulation with the findings. ``note`` is shown in the report. A
+    file whose text ends in an internal error is left out, with a warning in the other files.
+
+    Returns:
+        The diagnosis with these warnings, and the written files.
     """
     from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
     from mkc_torch.report import diagnosis_report
 
-    texts = {"diagnosis.json": diagnosis_to_json(diagnosis)}
-    if diagnosis.model is not None:
-        texts["model.json"] = diagnosis.model.to_json()
-        with suppress(SourceError):
-            texts["corrected.py"] = diagnosis.model.to_python(folder=folder)
-    for name in {"model.json", "corrected.py"} - set(texts):
-        (folder / name).unlink(missing_ok=True)  # a file of an earlier diagnosis
+    model = diagnosis.model
+    made: dict[str, Callable[[Diagnosis], str]] = {}
+    if model is not None:
+        made["model.json"] = lambda _: model.to_json()
+        made["corrected.py"] = lambda _: model.to_python(folder=folder)
+    # the files with warnings come last
     if report:
-        texts["report.html"] = diagnosis_report(diagnosis, note=note, paths=paths)
-    for name, text in texts.items():
-        write_atomically(folder / name, text, overwrite=force)
-    return [folder / name for name in texts]
+        made["report.html"] = lambda d: diagnosis_report(d, note=note, paths=paths)
+    made["diagnosis.json"] = diagnosis_to_json
+    texts: dict[str, str] = {}
+    for name, text_of in made.items():
+        text, warnings = _text_of(name, text_of, diagnosis)
+        texts |= {} if text is None else {name: text}
+        diagnosis = replace(diagnosis, warnings=(*diagnosis.warnings, *warnings)) if warnings else diagnosis
+    for name in {"model.json", "corrected.py", *made} - set(texts):
+        (folder / name).unlink(missing_ok=True)  # a file of an earlier diagnosis
+    files = [name for name in WRITTEN if name in texts]
+    for name in files:
+        write_atomically(folder / name, texts[name], overwrite=force)
+    return diagnosis, [folder / name for name in files]
+
+
+def _text_of(
+    name: str, text_of: Callable[[Diagnosis], str], diagnosis: Diagnosis
+) -> tuple[str | None, tuple[str, ...]]:
+    """Return the text of a file, and no warning; or None for a model without source, or with a warning on an error."""
+    try:
+        return text_of(diagnosis), ()
+    except SourceError:
+        return None, ()
+    except Exception as error:
+        return None, (failure(f"writing {name}", error),)
 
 
 def _parts(recording: Recording, simulation: Simulation, folder: Path) -> Iterator[tuple[str, Recording, Path]]:
@@ -219,13 +256,19 @@ def _outcome(
                 )
             progress("writing the report")
             paths = _paths(path, folder, request)
-            files = write_diagnosis(diagnosis, folder, force=request.force, report=request.report, paths=paths)
+            whole = write_diagnosis(diagnosis, folder, force=request.force, report=request.report, paths=paths)
     except Exception as error:
         own = raised_in(request.simulation, error) if is_file_of_a_simulation(request.simulation) else None
         return _failed(path, label, own or error)
     stopped = diagnosis.stop is not None and diagnosis.stop.reason == "interrupt"
-    text = look.set(lambda console: show(console, diagnosis, files, paths))
-    return Outcome(text, failed=False, interrupted=stopped, doubtful=conclusion(diagnosis).doubtful)
+    written, files = whole
+    doubtful = conclusion(written).doubtful or written is not diagnosis
+    try:
+        text = look.set(lambda console: show(console, written, files, paths))
+    except Exception as error:
+        text = "\n".join([failure("printing the summary", error), *map(str, files), ""])
+        doubtful = True
+    return Outcome(text, failed=False, interrupted=stopped, doubtful=doubtful)
 
 
 def _paths(path: Path, folder: Path, request: Request) -> RunPaths | None:

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from mkc_torch._support.typesetting import plain, typeset
 from mkc_torch.cli.remarks import note_rows, warning_rows
+from mkc_torch.diagnosis.findings.per_recording import differing_sizes
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.diagnosis.verdict import Answer
 from mkc_torch.report.diagnosis import before_search, environment, noise, numbers, unseen, untested
@@ -91,7 +92,9 @@ def _graded(finding: Finding) -> str:
 def _of_finding(finding: Finding, diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     f = finding
     parameters = sentences.stated_parameters(f)
-    lines = [line for p in parameters for line in numbers.named_lines(p, f.channels)]
+    common = [p for p in parameters if p.of_shape or not f.recordings]
+    differing = [typeset(sentence) for sentence in differing_sizes(f.parameters, f.recordings)]
+    lines = [*differing, *(line for p in common for line in numbers.named_lines(p, f.channels))]
     if len(lines) > _MOST_LINES:
         lines = [numbers.largest(p) for p in parameters[:_MOST_LINES]]
         lines.append("further parameters: see the report")

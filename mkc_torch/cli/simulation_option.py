@@ -16,6 +16,7 @@ OWN_SIMULATION = "FILE.py:CLASS, FILE.py with a single class, or MODEL.fmu. The 
 COLUMNS_METAVAR = "NAME=COLUMN,..."
 COLUMNS_HELP = "Names of the columns in the file: mag_x=mx,temperature=IMU_T"
 INPUT_HOLD_HELP = f"Known course of an input between samples: {', '.join(INPUT_HOLDS)}."
+SIZES_OF_HELP = "Diagnosed recording whose sizes apply, where a size differs between recordings."
 RUN_COLUMN_HELP = "Column that separates the runs of a table; default: experiment, if any."
 
 

@@ -5,13 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from time import monotonic
 
 from mkc_torch._parallel.deadline import Stopped, limited
 from mkc_torch._parallel.progress import counting
 from mkc_torch.diagnosis.model.suspect import texts_of
 from mkc_torch.diagnosis.optional import optional_steps
-from mkc_torch.diagnosis.pipeline.partial import PartialResult, build_result, cut_short, estimate, run_tests
+from mkc_torch.diagnosis.pipeline.partial import (
+    PartialResult,
+    after_error,
+    build_result,
+    cut_short,
+    estimate,
+    run_tests,
+)
 from mkc_torch.diagnosis.pipeline.prepare import Problem, SearchOptions, prepare
 from mkc_torch.diagnosis.pipeline.restarts import restarted_problem, with_restarts_stated, without_restarts_stated
 from mkc_torch.diagnosis.pipeline.search import fit_baseline, stepwise_search
@@ -86,7 +94,8 @@ def diagnose(
         time_limit: seconds after which the search stops and returns what is known; ``stop`` lists what was not done.
             None for no limit.
         progress: called with the name of each stage as it begins. If it has a method ``count(thing, done, total)``,
-            that method is called with the progress within a stage, such as the number of fitted candidates.
+            that method is called with the progress within a stage, such as the number of fitted candidates. A method
+            ``found(text)`` is called with what was found so far.
 
     Returns:
         The diagnosis.
@@ -149,14 +158,25 @@ def _with_or_without_restarts(
 
 
 def _result_of(problem: Problem, known: PartialResult, limit: float, begin: float) -> Diagnosis:
-    """Return the result of the stages, or of those before the time limit."""
+    """Return the result of the stages, or of those before the time limit or an internal error."""
     with limited(limit, begin=begin) as deadline, counting(problem.progress):
+        step = ""
         try:
             baseline = fit_baseline(problem, known)
+            step = "searching for effects"
             steps = stepwise_search(problem, known, baseline)
+            step = "checking what was found"
             final = estimate(known, steps)
+            step = "running the tests of evidence"
             evidence = run_tests(known, steps, final)
+            step = "describing the result"
             return build_result(known, steps, evidence)
         except Stopped as stopped:
-            reason, seconds = stopped.reason, deadline.elapsed
-    return cut_short(known, reason, seconds, limit)
+            ended: Callable[[], Diagnosis] = partial(cut_short, known, stopped.reason, deadline.elapsed, limit)
+        except NoFitError:
+            raise  # the simulation is tried with restarts
+        except Exception as error:
+            if not step:
+                raise
+            ended = partial(after_error, known, step, error, deadline.elapsed)
+    return ended()

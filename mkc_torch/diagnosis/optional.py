@@ -62,11 +62,21 @@ def optional(
         known = _warnings.get()
         if known is None or known.process != os.getpid() or not possible():
             raise
-        known.sentences.append(
-            f"The step '{step}' ended in an internal error ({type(error).__name__}: {_in_one_line(error)}); the result "
-            "is that before it. Please report this."
-        )
+        known.sentences.append(failure(step, error))
     return otherwise()
+
+
+def failure(step: str, error: Exception) -> str:
+    """Return the warning on a step that ended in an internal error.
+
+    Example:
+        >>> failure("counting", RuntimeError("sizes differ")).partition(";")[0]
+        "The step 'counting' ended in an internal error (RuntimeError: sizes differ)"
+    """
+    return (
+        f"The step '{step}' ended in an internal error ({type(error).__name__}: {_in_one_line(error)}); the result "
+        "is that before it. Please report this."
+    )
 
 
 def _in_one_line(error: Exception) -> str:

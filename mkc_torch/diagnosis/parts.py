@@ -192,6 +192,7 @@ class Finding:
     ``map`` is for the report; None if it cannot be drawn.
     ``region`` is None if the gain spreads over all states, or if the simulation has no states.
     ``experiments`` has each run's share of the gain; empty for a single run.
+    ``recordings`` are the recordings that each have a size of their own; empty for a common size.
     ``event_times`` are the times in s at which an effect with several onsets sets in; the first is its onset.
     ``references`` are the reference values of the drivers in the equation.
     ``advice`` is what to do about the finding; ``recurrence`` states whether it recurs in another recording.
@@ -224,6 +225,7 @@ class Finding:
     curve: Curve | None = None
     region: Region | None = None
     experiments: tuple[float, ...] = ()
+    recordings: tuple[str, ...] = ()
     map: StateMap | None = None
     event_times: tuple[float, ...] = ()
     references: tuple[Reference, ...] = ()

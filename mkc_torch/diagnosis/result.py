@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from torch import Tensor, nn
 
@@ -90,17 +90,17 @@ class Stop:
     """Why a diagnosis was stopped before its end, and what was not done.
 
     Attributes:
-        reason: "time limit" or "interrupt".
+        reason: "time limit", "interrupt" or "internal error".
         seconds: run time until the stop.
         not_done: the missing parts, as nouns.
     """
 
-    reason: Reason
+    reason: Reason | Literal["internal error"]
     seconds: float
     not_done: tuple[str, ...]
 
     def __str__(self) -> str:
-        how = "by an interrupt " if self.reason == "interrupt" else ""
+        how = "" if self.reason == "time limit" else f"by an {self.reason} "
         left = "; ".join(self.not_done)
         return f"Stopped {how}after {self.seconds:.0f} s: the search was not finished; not done: {left}."
 

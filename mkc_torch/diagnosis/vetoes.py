@@ -19,6 +19,7 @@ from mkc_torch.diagnosis.environment import Grade
 from mkc_torch.diagnosis.held_out_gain import better_on_average, change, confirmation, mean_ratio
 from mkc_torch.diagnosis.parts import Finding, HeldOut
 from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE, LEVEL, SMALL, VISIBLE
+from mkc_torch.effects.base import PER_RECORDING
 
 
 @dataclass(frozen=True)
@@ -242,7 +243,8 @@ def spelled(finding: Finding) -> str:
         'linear_drag@speed'
     """
     places = [re.sub("^(rate of|input|parameter) ", "", name) for name in finding.channels]
-    return "@".join(filter(None, [finding.effect, ",".join(finding.drivers or places)]))
+    effect = f"{finding.effect}{PER_RECORDING}" if finding.recordings else finding.effect
+    return "@".join(filter(None, [effect, ",".join(finding.drivers or places)]))
 
 
 def is_zero_within_error(finding: Finding) -> bool:

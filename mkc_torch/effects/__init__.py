@@ -22,6 +22,7 @@ from mkc_torch.effects.dynamics.unknown_near_ends import curve_within
 from mkc_torch.effects.kinds import kind_of
 from mkc_torch.effects.paired import PAIRED
 from mkc_torch.effects.paired.between import shifted
+from mkc_torch.effects.per_recording import selected_size
 from mkc_torch.effects.sensor import ATTITUDE, SENSOR
 from mkc_torch.effects.share import soft_clip
 from mkc_torch.effects.waveforms import lagged, played
@@ -51,6 +52,7 @@ __all__ = [
     "lagged",
     "played",
     "resampled",
+    "selected_size",
     "shifted",
     "soft_clip",
     "travelled",

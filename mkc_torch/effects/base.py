@@ -28,6 +28,10 @@ _SPELLINGS = {
 """Spellings that differ from the plain words of an id: names of people and hyphenated words."""
 
 
+PER_RECORDING = "_per_recording"
+"""End of the name of an effect with a γ for each recording."""
+
+
 class Effect(ABC):
     """A piece of physics with an amplitude γ of q numbers. At γ = 0 it changes nothing.
 
@@ -83,6 +87,8 @@ class Effect(ABC):
             None.
         open_loop_only: whether it is computed and fitted along the open loop only, because along a trajectory that an
             observer corrects it would read the recording ahead; default False.
+        recordings: names of recordings that are diagnosed together and each have a γ of their own; default none: a
+            common γ.
 
     Amplitude and shape:
 
@@ -155,6 +161,7 @@ class Effect(ABC):
     settles: tuple[str, ...] = ()
     mistaken_for: Effect | None = None
     open_loop_only: bool = False
+    recordings: tuple[str, ...] = ()
 
     lower: float = -math.inf
     upper: float = math.inf
@@ -182,6 +189,11 @@ class Effect(ABC):
     @property
     def display_name(self) -> str:
         return in_words(self.id)
+
+    @property
+    def form_id(self) -> str:
+        """The id, which for an effect with a γ for each recording ends in ``_per_recording``."""
+        return f"{self.id}{PER_RECORDING}" if self.recordings else self.id
 
     @property
     def simpler(self) -> Effect | None:

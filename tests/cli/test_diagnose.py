@@ -401,7 +401,7 @@ def test_a_failed_write_leaves_no_partial_file(step_diagnosis, tmp_path, monkeyp
 
 def test_without_a_model_an_old_model_file_is_removed(tmp_path):
     (tmp_path / "model.json").write_text("of an earlier diagnosis")
-    written = diagnosis_files.write_diagnosis(make_diagnosis(0, model=None), tmp_path, force=True)
+    _, written = diagnosis_files.write_diagnosis(make_diagnosis(0, model=None), tmp_path, force=True)
     assert [path.name for path in written] == ["diagnosis.json", "report.html"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["diagnosis.json", "report.html"]
 

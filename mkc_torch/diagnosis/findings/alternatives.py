@@ -93,7 +93,7 @@ def _special_case(term: Term) -> str | None:
 
 
 def _place(term: Term) -> _Place:
-    return term.effect.id, term.columns, term.at
+    return term.effect.form_id, term.columns, term.at
 
 
 def _named(rival: Alternative) -> _Place:

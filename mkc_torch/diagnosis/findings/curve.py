@@ -15,6 +15,7 @@ from mkc_torch.diagnosis.environment import Curve
 from mkc_torch.diagnosis.findings.shape import FINE_POINTS, drawn_points
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects.context import Context
+from mkc_torch.effects.per_recording import PerRecording
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -29,7 +30,8 @@ _NEAR, _FEWEST_NEAR = 0.05, 3
 def curve_of_effect(term: Term, gamma: Tensor, covariance: Tensor, context: Context) -> Curve | None:
     """Return the effect's change at its port over its driver, signal or time, with its 95 % band.
 
-    A free curve is NaN where the recording has no samples: there only its basis decides.
+    A free curve is NaN where the recording has no samples: there only its basis decides. A size that differs between
+    recordings gives a curve for each recording.
     """
     made = _along(term, context)
     if made is None:
@@ -38,11 +40,14 @@ def curve_of_effect(term: Term, gamma: Tensor, covariance: Tensor, context: Cont
     shape = {name: value for name, value in term.shape.items() if name != "lag"}
 
     def change(gamma: Tensor) -> Tensor:
-        return term.effect.change(gamma, shape, synthetic)
+        each = [term.effect.change(gamma, shape, one) for one in _of_each_recording(term, synthetic)]
+        return torch.cat(each, -1)
 
     slope = torch.func.jacfwd(dual_constants(change))(gamma)
     variance = torch.einsum("ncq,qr,ncr->nc", slope, covariance, slope).clamp(min=0.0)
     channels, value_unit = places_of(term, context.channels), tidy(context.signal_unit)
+    if term.effect.recordings:
+        channels = tuple(f"{channel} in {name}" for name in term.effect.recordings for channel in channels)
     value = change(gamma).detach()
     # formulas are fitted to evenly spaced points of a free curve
     kept = drawn_points(value, evenly=term.effect.is_curve or driver == "time")
@@ -52,6 +57,14 @@ def curve_of_effect(term: Term, gamma: Tensor, covariance: Tensor, context: Cont
         value, band = value.clone(), band.clone()
         value[unseen] = band[unseen] = torch.nan
     return Curve(driver, unit, x[kept], value[kept], band[kept], channels, value_unit)
+
+
+def _of_each_recording(term: Term, context: Context) -> list[Context]:
+    """Return the context in each recording, where the size differs between them."""
+    if not isinstance(term.effect, PerRecording):
+        return [context]
+    runs = term.effect.first_runs
+    return [replace(context, run=torch.full_like(context.time, run, dtype=torch.long)) for run in runs]
 
 
 def is_sampled(x: Float[Tensor, " P"], known: Float[Tensor, " N"]) -> Bool[Tensor, " P"]:

@@ -14,6 +14,7 @@ from mkc_torch.diagnosis.evidence.base import gain_of
 from mkc_torch.diagnosis.findings.advice import SAME, distinguishing_state
 from mkc_torch.diagnosis.findings.at_input import size_at_input
 from mkc_torch.diagnosis.findings.curve import curve_of_effect, places_of
+from mkc_torch.diagnosis.findings.per_recording import differing_sizes
 from mkc_torch.diagnosis.findings.regions import attributed, map_of, region_of, shares_of_runs
 from mkc_torch.diagnosis.findings.shape import formulas
 from mkc_torch.diagnosis.model.fit import FittedModel
@@ -25,6 +26,7 @@ from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE
 from mkc_torch.effects.context import Context
 from mkc_torch.effects.kinds import kind_at
+from mkc_torch.effects.per_recording import is_relative
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
@@ -133,6 +135,8 @@ def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quic
     of_motion_or_driver = term.effect.is_curve and not term.effect.unrecorded
     approximations = formulas(curve) if of_motion_or_driver and curve is not None else ()
     event_times = term.effect.moments(context)
+    parameters = all_parameters(final, number)
+    differs = differing_sizes(parameters, term.effect.recordings)
     return Finding(
         effect=term.effect.id,
         drivers=term.columns,
@@ -140,8 +144,8 @@ def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quic
         intervals=intervals_of(gain_of(final, number), final.fit.model.prepared.time),
         onset=event_times[0] if event_times else term.shape.get("onset"),
         equation="; ".join([term.effect.equation_of(term.shape, context), *approximations]),
-        explanation=term.effect.explained(gamma.tolist(), term.shape, context),
-        parameters=all_parameters(final, number),
+        explanation=" ".join(filter(None, [term.effect.explained(gamma.tolist(), term.shape, context), *differs])),
+        parameters=parameters,
         p_value=None if quick else located.p_value,
         alternatives=_alternatives(located, term),
         plausible=plausible and not cannot_be,
@@ -153,6 +157,7 @@ def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quic
         curve=curve,
         region=None if where is None else region_of(where),
         experiments=() if where is None else shares_of_runs(where),
+        recordings=term.effect.recordings,
         map=None if where is None else map_of(where),
         event_times=event_times,
         references=_references(term),
@@ -230,7 +235,7 @@ def parameters_of(
 
 def _components(term: Term, quantity: str, size: int, context: Context) -> tuple[str, ...]:
     """Return the component names of a quantity: those of the effect, or the channels."""
-    if size < 2:
+    if size < 2 and not is_relative(term.effect):
         return ()
     own = term.effect.components(quantity, term.shape, context)
     return own or (tuple(context.channels) if size == len(context.channels) else ())
@@ -278,15 +283,23 @@ def _alternatives(located: SearchResult, term: Term) -> tuple[Alternative, ...]:
         ]
     separable = located.scene.settings.naming.separable
     own = [ranked.number for ranked in located.ranking if located.scene.terms[ranked.number].key == term.key]
+    common = {
+        located.scene.terms[ranked.number].family: ranked.gap
+        for ranked in located.ranking
+        if not located.scene.terms[ranked.number].effect.recordings
+    }
+    shown = {term.family}  # a common size and a size of each recording are the same physics
     for ranked in located.ranking:
         rival = located.scene.terms[ranked.number]
-        if rival.key == term.key or ranked.gap > _FARTHEST:
+        has_common = bool(rival.effect.recordings) and common.get(rival.family, math.inf) < separable
+        if rival.family in shown or has_common or ranked.gap > _FARTHEST:
             continue
+        shown.add(rival.family)
         gap = max(ranked.gap, 0.0)
         again, text = rival.effect.recurrence, ""
         if own and gap < separable:
             text = distinguishing_state(located, own[0], ranked.number)
-        found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= separable, rival.at, again, text))
+        found.append(Alternative(rival.effect.form_id, rival.columns, gap, gap >= separable, rival.at, again, text))
     near = [a for a in found if not a.separable]
     return tuple(near + [a for a in found if a.separable][: max(0, _MOST_ALTERNATIVES - len(near))])
 
@@ -323,12 +336,12 @@ def labels(terms: Sequence[Term]) -> tuple[str, ...]:
     """Return ``effect (driver)`` of terms, with the port if it is ambiguous."""
     places: dict[tuple[str, tuple[str, ...]], set[str]] = {}
     for term in terms:
-        places.setdefault((term.effect.id, term.columns), set()).add(term.port)
+        places.setdefault((term.effect.form_id, term.columns), set()).add(term.port)
     several = {key for key, found in places.items() if len(found) > 1}
     return tuple(
-        t.effect.id
+        t.effect.form_id
         + (f" ({', '.join(t.columns)})" if t.columns else "")
-        + (f" at {t.port}" if (t.effect.id, t.columns) in several else "")
+        + (f" at {t.port}" if (t.effect.form_id, t.columns) in several else "")
         for t in terms
     )
 

@@ -323,6 +323,8 @@ def _finding(finding: Finding) -> dict[str, Any]:
         **({} if f.at_input is None else {"at_input": _json(f.at_input)}),
         "p_value": f.p_value,
         "shape": None if f.shape is None else _shape(f.shape),
+        "held_out": None,
+        "held_out_note": "not measured, because its test ended in an internal error",
         "alternatives": [
             {
                 "effect": a.effect,
@@ -338,10 +340,8 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "plausible": f.plausible,
         "plausibility": f.plausibility,
         **({} if f.region is None else {"region": asdict(f.region)}),
-        **({"experiments": f.experiments} if f.experiments else {}),
-        **({"event_times": f.event_times} if f.event_times else {}),
+        **{key: value for key in ("experiments", "recordings", "event_times", "advice") if (value := getattr(f, key))},
         **({"references": [asdict(reference) for reference in f.references]} if f.references else {}),
-        **({"advice": f.advice} if f.advice else {}),
     }
     return _with_evidence(content, f.evidence, json_schema()["$defs"]["finding"])
 

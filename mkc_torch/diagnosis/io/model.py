@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from mkc_torch.diagnosis.declared import checked_input_hold
 from mkc_torch.diagnosis.io.python_source import SourceError, python_source
+from mkc_torch.diagnosis.io.selected_sizes import refuse_unselected, selected, without_runs
 from mkc_torch.diagnosis.io.training import Training
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.joint import in_order_of_the_chain, summed
@@ -22,6 +23,7 @@ from mkc_torch.diagnosis.result import CorrectingModel
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context
+from mkc_torch.effects.per_recording import PerRecording, is_relative
 from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
 from mkc_torch.recording.recording import MissingColumnError, Recording
 from mkc_torch.simulation.dynamics import Dynamics
@@ -113,8 +115,28 @@ class DiagnosedModel(CorrectingModel):
         """
         known = dict(self.state.get("input_hold", {}))
         state = {**self.state, "input_hold": {**known, **checked_input_hold(hold, tuple(known))}}
-        gammas = list(self.gammas)
-        return DiagnosedModel(self.simulation, state, self.theta, self.terms, gammas, self.source, self.reference)
+        return self._with(self.terms, list(self.gammas), state)
+
+    def with_sizes_of(self, recording: str) -> DiagnosedModel:
+        """Return the model with the sizes of one of the diagnosed recordings, where sizes differ between them.
+
+        Args:
+            recording: its name.
+
+        Raises:
+            ValueError: no size differs, or the recording is not one of them.
+        """
+        return self._with(*selected(self.terms, list(self.gammas), recording))
+
+    def for_other_recordings(self) -> DiagnosedModel:
+        """Return the model without the assignment of runs to the diagnosed recordings."""
+        return self._with(without_runs(self.terms), list(self.gammas))
+
+    def _with(
+        self, terms: Sequence[Term], gammas: Sequence[Tensor], state: Mapping[str, Any] | None = None
+    ) -> DiagnosedModel:
+        state = self.state if state is None else state
+        return DiagnosedModel(self.simulation, state, self.theta, terms, gammas, self.source, self.reference)
 
     def correct(self, recording: Recording) -> tuple[dict[str, Float[Tensor, " N"]], tuple[str, ...]]:
         """Return the corrected signal of a recording (N,), and notes on effects that do not transfer.
@@ -124,6 +146,7 @@ class DiagnosedModel(CorrectingModel):
 
         Raises:
             MissingColumnError: a column of the simulation, or an effect's driver, is missing.
+            ValueError: a size differs between the diagnosed recordings, and none is selected by :meth:`with_sizes_of`.
         """
         correction = correction_of(self.simulation, self.state, recording, self.source)
         changes, notes = self.changes(correction)
@@ -137,7 +160,9 @@ class DiagnosedModel(CorrectingModel):
 
         Raises:
             MissingColumnError: an effect's driver is missing.
+            ValueError: a size differs between the diagnosed recordings, and none is selected.
         """
+        refuse_unselected(self.terms)
         changes: dict[str, Change] = {}
         notes = []
         for number in in_order_of_the_chain(self.terms, range(len(self.terms))):
@@ -182,6 +207,8 @@ class DiagnosedModel(CorrectingModel):
                 "shape": dict(term.shape),
                 **({"port": term.at} if term.at else {}),
                 **({"first": True} if term.first else {}),
+                **({"recordings": list(term.effect.recordings)} if term.effect.recordings else {}),
+                **({"relative": True} if is_relative(term.effect) else {}),
                 "parameters": gamma.tolist(),
                 "equation": term.effect.equation,
             }
@@ -298,7 +325,10 @@ def _read(content: Mapping[str, Any], known: Sequence[Effect], simulation: Simul
             names, units = tuple(c["column"] for c in columns), tuple(c["unit"] for c in columns)
             driver = Driver(names, "", reference.new_zeros(0, len(columns)), reference, units)
         shape = {name: _finite(value) for name, value in entry["shape"].items()}
-        terms.append(Term(_effect(entry, known), driver, shape, entry.get("port", ""), entry.get("first", False)))
+        effect = _effect(entry, known)
+        if "recordings" in entry:
+            effect = PerRecording(effect, entry["recordings"], relative=entry.get("relative", False))
+        terms.append(Term(effect, driver, shape, entry.get("port", ""), entry.get("first", False)))
         gammas.append(_vector(entry["parameters"]))
     known_fit = Training.from_dict(content["training"]) if "training" in content else None
     theta = _vector(content["parameters"])

@@ -36,6 +36,7 @@ _FROM_HERE: Mapping[str, str] = {
     "curve_within(": "from mkc_torch.effects import curve_within",
     "travelled(": "from mkc_torch.effects import travelled",
     "beyond(": "from mkc_torch.effects import beyond",
+    "selected_size(": "from mkc_torch.effects import selected_size",
     "SimpleNamespace(": "from types import SimpleNamespace",
     "Parameter(": "from mkc_torch.simulation import Parameter",
 }
@@ -92,6 +93,7 @@ def python_source(
         "    parameters = {",
         *(f"        {line}" for line in _parameters(system, theta)),
         "    }",
+        *_sizes_of(terms),
         *_inputs(system, terms),
         *_hold(system, holds),
         *_restarts(system),
@@ -167,6 +169,12 @@ def _parameters(system: Dynamics, theta: Sequence[float]) -> list[str]:
             number = f"Parameter({', '.join([number, *sentences])})"
         lines.append(f'"{name}": {number},')
     return lines
+
+
+def _sizes_of(terms: Sequence[Term]) -> list[str]:
+    """Return the line that selects the recording whose sizes apply, where sizes differ between recordings."""
+    names = next((term.effect.recordings for term in terms if term.effect.recordings), ())
+    return [f'    sizes_of = ""  # set to the recording whose sizes apply: {", ".join(map(repr, names))}'] * bool(names)
 
 
 def _inputs(system: Dynamics, terms: Sequence[Term]) -> list[str]:

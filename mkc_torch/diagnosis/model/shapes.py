@@ -27,6 +27,7 @@ from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Shape
 from mkc_torch.effects.kinds import kind_of
+from mkc_torch.effects.per_recording import PerRecording, can_differ
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.ports import Change, Nearby, Port, SignalSizes
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
@@ -68,7 +69,24 @@ def candidates_of(
     roles = frozenset(role for effect in effects for role in effect.roles)
     found = find_drivers(prepared.recording, simulation.columns, settings, roles, simulation.measured)
     more = further_drivers(prepared, found.drivers, settings)
-    return found, candidate_terms(prepared, (*found.drivers, *more), effects)
+    terms = candidate_terms(prepared, (*found.drivers, *more), effects)
+    return found, (*terms, *per_recording(terms, prepared))
+
+
+def per_recording(terms: Sequence[Term], prepared: PreparedSimulation) -> tuple[Term, ...]:
+    """Return the candidates that can have a size for each recording in this form; none for a single recording.
+
+    Only for differential equations, whose search compares the forms by their score.
+    """
+    dynamics = prepared.dynamics
+    if dynamics is None or len(dynamics.recordings) < 2:
+        return ()
+    forms = {
+        id(term.effect): PerRecording(term.effect, dynamics.recordings, dynamics.of_run)
+        for term in terms
+        if can_differ(term.effect)
+    }
+    return tuple(replace(term, effect=forms[id(term.effect)]) for term in terms if id(term.effect) in forms)
 
 
 def candidate_terms(

@@ -165,7 +165,8 @@ def suspect_id(term: Term, terms: Sequence[Term] = ()) -> str:
         >>> suspect_id(Term(CoulombFriction(), None, {}, "rate of speed"))
         'coulomb_friction@speed'
     """
-    ports = {other.port: short_name(other.effect, other.port) for other in terms if other.effect.id == term.effect.id}
+    own = term.effect.form_id
+    ports = {other.port: short_name(other.effect, other.port) for other in terms if other.effect.form_id == own}
     short = short_name(term.effect, term.port)
     alike = short in ports or sum(short == other for other in ports.values()) > 1
     return spelled(term.effect, term.port if alike else short, term.columns)
@@ -180,7 +181,7 @@ def spelled(effect: Effect, port: str, columns: Sequence[str]) -> str:
         ('driver_input_gain@current(temperature)', 'driver_input_gain@"der(x)"("a  b")')
     """
     driver = f"({_quoted(', '.join(columns), _DRIVER)})" if columns else ""
-    return f"{_quoted(effect.id, _EFFECT)}@{_quoted(port, _PORT)}{driver}"
+    return f"{_quoted(effect.form_id, _EFFECT)}@{_quoted(port, _PORT)}{driver}"
 
 
 def short_name(effect: Effect, port: str) -> str:
@@ -250,7 +251,7 @@ def _of_effect(name: str, terms: Sequence[Term], prepared: PreparedSimulation) -
     Raises:
         ValueError: there is no such effect, or it cannot act in the simulation.
     """
-    found = tuple(term for term in terms if term.effect.id == name)
+    found = tuple(term for term in terms if term.effect.form_id == name)
     if found:
         return found
     there = dict.fromkeys(term.effect.id for term in terms)

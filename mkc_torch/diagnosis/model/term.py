@@ -250,7 +250,7 @@ def _singles(
 
 
 Key = tuple[str, tuple[str, ...], str]
-"""Identity of a candidate without its shape: the effect's id, its columns and its port."""
+"""Identity of a candidate without its shape: the effect's ``form_id``, its columns and its port."""
 
 
 @dataclass(frozen=True)
@@ -278,6 +278,11 @@ class Term:
     @property
     def key(self) -> Key:
         """Identity without the shape."""
+        return self.effect.form_id, self.columns, self.port
+
+    @property
+    def family(self) -> Key:
+        """Identity without the shape, the same for a common size and for a size of each recording."""
         return self.effect.id, self.columns, self.port
 
     def context(self, prepared: PreparedSimulation, signal: Tensor | None) -> Context:

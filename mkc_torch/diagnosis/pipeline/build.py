@@ -242,8 +242,10 @@ def _model(whole: DiagnosisInputs, fit: FittedModel) -> DiagnosedModel:
     work = partial(with_training, model, parameters, prepared.state, recording, columns)
     bare = with_baseline(model, parameters, prepared.state)
     if whole.stop is not None:
-        return within(_MOMENT_S, work) or bare
-    return optional("predicting the recording as in a check", work, lambda: bare)
+        found = within(_MOMENT_S, work) or bare
+    else:
+        found = optional("predicting the recording as in a check", work, lambda: bare)
+    return found.for_other_recordings()
 
 
 def is_flexible(term: Term) -> bool:
@@ -386,7 +388,7 @@ def _candidates(first: SearchResult | None) -> tuple[CandidateScore, ...]:
         return ()
     return tuple(
         CandidateScore(
-            first.scene.terms[r.number].effect.id,
+            first.scene.terms[r.number].effect.form_id,
             first.scene.terms[r.number].columns,
             described(first.scene.terms[r.number].effect, first.scene.terms[r.number].shape),
             r.gain,

@@ -61,6 +61,7 @@ def search_models(
     generator: torch.Generator,
     keep: Keep,
     lines: Lines = lambda _: None,
+    progress: Callable[[str], object] = lambda _: None,
 ) -> StepwiseSearch:
     """Screen the candidates; if the strongest is significant, search the best set of effects and test each of them.
 
@@ -71,6 +72,7 @@ def search_models(
         generator: of the surrogates.
         keep: receives the search so far.
         lines: the search for a line in a residual, whose candidates are searched with the others.
+        progress: called with the name of each stage.
 
     Raises:
         NoFitError: the fit's trajectory is lost.
@@ -94,6 +96,7 @@ def search_models(
     keep(search)
     if options.max_findings == 0 and not options.suspect:
         return replace(search, left=())
+    progress("comparing models")
     beam = _beam(base, first, terms, options)
     suspected = suspected_models(options.suspect, beam, _start(base), settings.noise, quick=options.quick)
     search = replace(search, models=(*trail_of(beam, None), *suspected))
@@ -106,6 +109,7 @@ def search_models(
     if first.p_value > options.level:
         follow = _follow(beam) if not options.quick else ()
         return replace(search, left=(), first=replace(first, follow=follow))
+    progress("testing the effects of the best models")
     p_values = _PValues(others, line, lines)
     tested = partial(
         _tested, search, p_values=p_values, beam=beam, base=base, options=options, generator=generator, keep=keep
@@ -297,8 +301,8 @@ def _screened_with_line(
 
 def _left(fit: FittedModel, beam: BeamSearch) -> tuple[Term, ...]:
     """Return the candidates of the screening that a model lacks."""
-    before = {term.key for term in fit.model.terms}
-    return tuple(term for term in beam.terms if term.key not in before and not term.effect.by_periodogram)
+    before = {term.family for term in fit.model.terms}
+    return tuple(term for term in beam.terms if term.family not in before and not term.effect.by_periodogram)
 
 
 def _final(step: Candidate, beam: BeamSearch, options: SearchOptions, *, last: bool) -> Candidate:

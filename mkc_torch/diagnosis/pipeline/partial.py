@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from typing import Literal
 
 from mkc_torch._parallel.deadline import Reason, within
+from mkc_torch._parallel.progress import report_found
 from mkc_torch.diagnosis.evidence import TESTS
 from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceTest
 from mkc_torch.diagnosis.evidence.held_out import Evidence, blocks_of, on_all
@@ -17,12 +20,14 @@ from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, first_samples
 from mkc_torch.diagnosis.model.shapes import candidates_of, within_a_sample
 from mkc_torch.diagnosis.model.term import Drivers, Term, common_parts
-from mkc_torch.diagnosis.optional import optional
+from mkc_torch.diagnosis.optional import failure, optional
 from mkc_torch.diagnosis.pipeline.build import DiagnosisInputs, build_diagnosis
 from mkc_torch.diagnosis.pipeline.prepare import Problem
 from mkc_torch.diagnosis.pipeline.search_notes import with_search_notes
+from mkc_torch.diagnosis.pipeline.so_far import found_so_far
 from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.result import Diagnosis, Stop
+from mkc_torch.diagnosis.search.moves import with_references
 from mkc_torch.diagnosis.search.run import SearchResult
 
 
@@ -59,6 +64,13 @@ class PartialResult:
     def keep_search(self, search: StepwiseSearch) -> None:
         """Store the search so far."""
         self.search = search
+
+    def keep_and_report(self, search: StepwiseSearch) -> None:
+        """Store the search so far, and report its findings."""
+        self.keep_search(search)
+        text = found_so_far(search, self.options.level)
+        if text:
+            report_found(text)
 
     def continued(
         self, step: str, work: Callable[[], StepwiseSearch], before: StepwiseSearch | None = None
@@ -114,7 +126,10 @@ class PartialResult:
         """The recorded columns that can drive an effect, and the candidates."""
         if self._candidates is None:
             prepared, settings = self.base.model.prepared.open_loop(), self.options.settings
-            self._candidates = candidates_of(self.simulation, prepared, self.effects, settings.drivers)
+            drivers, terms = candidates_of(self.simulation, prepared, self.effects, settings.drivers)
+            free = self.fitted_baseline.free
+            alone = self.base if free is None else free
+            self._candidates = drivers, with_references(alone, terms, settings.noise)
         return self._candidates
 
     def open_loop_findings(self, search: StepwiseSearch) -> OpenLoop:
@@ -186,6 +201,7 @@ def estimate(known: PartialResult, search: StepwiseSearch) -> EvidenceContext:
 
 def run_tests(known: PartialResult, search: StepwiseSearch, case: EvidenceContext) -> EvidenceReport:
     """The fifth stage: the tests of evidence, and the standard errors of the final parameters."""
+    known.problem.progress("running the tests of evidence")
     base = known.base
     parts = common_parts(base.model.prepared.open_loop(), known.candidates[1])
     return all_results(case, known.tests, [known.simulation, base, base.model, *parts, *search.parts])
@@ -193,6 +209,7 @@ def run_tests(known: PartialResult, search: StepwiseSearch, case: EvidenceContex
 
 def build_result(known: PartialResult, search: StepwiseSearch, evidence: EvidenceReport) -> Diagnosis:
     """The sixth stage: the verdict, the findings with their evidence, advice and warnings."""
+    known.problem.progress("describing the result")
     return known.diagnosis(search, evidence)
 
 
@@ -210,7 +227,28 @@ def error_without_fit(reason: Reason, limit: float, where: str) -> BaseException
     )
 
 
-def cut_short(known: PartialResult, reason: Reason, seconds: float, limit: float) -> Diagnosis:
+def after_error(known: PartialResult, step: str, error: Exception, seconds: float) -> Diagnosis:
+    """Return the result of what is known after an internal error, with a warning that names the step.
+
+    Args:
+        known: the partial result, with the fit of the simulation.
+        step: name of the step.
+        error: that it ended in.
+        seconds: run time.
+
+    Raises:
+        Exception: the same error, if what is known cannot be described either.
+    """
+    try:
+        result = cut_short(known, "internal error", seconds)
+    except Exception:
+        raise error from None
+    return replace(result, warnings=(*result.warnings, failure(step, error)))
+
+
+def cut_short(
+    known: PartialResult, reason: Reason | Literal["internal error"], seconds: float, limit: float = math.inf
+) -> Diagnosis:
     """Return the result of what is known.
 
     Args:
@@ -222,6 +260,7 @@ def cut_short(known: PartialResult, reason: Reason, seconds: float, limit: float
         TimeoutError, KeyboardInterrupt: the first fit of the simulation had not ended.
     """
     if known.baseline is None:
+        assert reason != "internal error"
         raise error_without_fit(reason, limit, known.problem.where)
     known.problem.progress("writing down what is known")
     search = known.search if known.search is not None else _not_begun(known)

@@ -42,18 +42,18 @@ def stepwise_search(problem: Problem, known: PartialResult, baseline: ProcessNoi
     progress(f"trying {len(terms)} effects")
     lines = partial(line_candidates, drivers=known.candidates[0].drivers, effects=known.effects, options=options)
     if baseline.fit.model.prepared.dynamics is not None:
-        whole = partial(search_models, baseline, terms, options, generator, known.keep_search, lines)
+        whole = partial(search_models, baseline, terms, options, generator, known.keep_and_report, lines, progress)
         search = known.continued("searching models", whole)
         repeated = known.improved("halving the step of integration", partial(at_smaller_step, known, search), search)
         known.keep_search(repeated)
         return repeated
-    first = partial(first_line_step, baseline.fit, terms, options, generator, known.keep_search, lines)
+    first = partial(first_line_step, baseline.fit, terms, options, generator, known.keep_and_report, lines)
     search = known.continued("confirming the first finding", first)
     known.keep_search(search)
     while search.left:
         stage = f"trying {len(search.left)} effects in addition to {len(search.found)} found"
         progress(stage)
-        further = partial(next_step, search, options, generator, known.keep_search)
+        further = partial(next_step, search, options, generator, known.keep_and_report)
         before, search = search, known.continued(stage, further, search)
         known.keep_search(search)
         if search.found == before.found:

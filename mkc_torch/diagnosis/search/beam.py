@@ -9,6 +9,7 @@ from functools import partial
 
 import torch
 
+from mkc_torch._parallel.progress import report_bound, report_found
 from mkc_torch.diagnosis.model.fit import SEARCH, FittedModel, fitted, fitted_with_effect
 from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise, has_process_noise
 from mkc_torch.diagnosis.model.shapes import candidate_terms, shape_fitted, with_profiled_shape
@@ -16,12 +17,14 @@ from mkc_torch.diagnosis.model.suspect import suspect_id
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
 from mkc_torch.diagnosis.score import ScoreBasis, is_implausible, score, separation
 from mkc_torch.diagnosis.search.candidate import Candidate, ModelKey, in_order, model_key
+from mkc_torch.diagnosis.search.in_words import leading
 from mkc_torch.diagnosis.search.move_fits import (
     POLISHED,
     at_other_values,
     fits_at_own_holds,
     fitted_exchanged,
     fitted_held,
+    fitted_in_form,
     fitted_reordered,
     fitted_simpler,
     fitted_through_noise,
@@ -82,6 +85,7 @@ class BeamSearch:
     most_models: int = MOST_MODELS
     noisy: FittedModel | None = None
     fixed: Mapping[str, str] = field(default_factory=dict)
+    _running: bool = False
 
     def run(self, start: FittedModel, further: Sequence[Term] = ()) -> Candidate:
         """Search from the simulation alone; return the model with the highest score.
@@ -90,6 +94,7 @@ class BeamSearch:
             start: the simulation alone, in open loop if that is found.
             further: candidates that lead the screening, strongest first; they are tried first.
         """
+        self._running = True
         self._keep([Candidate(start, score(start, self.basis, self.settings), "")])
         terms = with_wide_grid(self.terms, start.model.prepared)
         expanded: set[ModelKey] = set()
@@ -105,6 +110,7 @@ class BeamSearch:
             self._hold_best(held)
         self._improve(terms, further, expanded)
         self._under_noise()
+        self._running = False
         return self.best
 
     @property
@@ -201,11 +207,18 @@ class BeamSearch:
                 rest = [other for other in fit.model.terms if other is not term]
                 works.append((model_key(rest), f"drop {self._id(term)}", partial(fitted_without, fit, number)))
             for other in special_cases(term, self.terms, fit.model.prepared):
-                if other.key in {known.key for known in fit.model.terms}:
+                if other.family in {known.family for known in fit.model.terms if known is not term}:
                     continue
-                rest = [*fit.model.terms[:number], *fit.model.terms[number + 1 :], other]
+                rest = [*fit.model.terms[:number], *fit.model.terms[number + 1 :]]
                 move = f"exchange {self._id(term)} for {self._id(other)}"
-                works.append((model_key(rest), move, partial(fitted_exchanged, fit, number, self._all(other, term))))
+                group = self._all(other, term)
+                if other.family == term.family:
+                    known = self.models.get(model_key(rest))
+                    less = None if known is None else known.fit
+                    work = partial(fitted_in_form, fit, number, group, self.settings.noise, less)
+                else:
+                    work = partial(fitted_exchanged, fit, number, group)
+                works.append((model_key([*rest, other]), move, work))
         orders = in_other_orders(fit)
         works += [(model_key(o), "another order in series", partial(fitted_reordered, fit, o)) for o in orders]
         self._fit(works, fit, most)
@@ -340,6 +353,8 @@ class BeamSearch:
             if key not in self.models and len(self.models) + len(new) < most:
                 new.setdefault(key, (move, work))
         tried = [partial(self._scored, move, work) for move, work in new.values()]
+        if self._running:
+            report_bound("model", len(self.models), self.most_models)
         found = run_parallel(tried, near.model.prepared, self.terms, "model")
         self._keep([model for model in found if model is not None])
 
@@ -350,6 +365,8 @@ class BeamSearch:
     def _keep(self, models: Iterable[Candidate]) -> None:
         for model in models:
             self.models[model.key] = model
+        if self._running and len(self.models) > 1:
+            report_found(leading(self.best.fit.model.terms))
 
     def _under_noise(self) -> None:
         """Fit the leading models under their process noise too; keep the fit that scores higher."""

@@ -195,6 +195,43 @@ def fitted_reordered(fit: FittedModel, terms: tuple[Term, ...]) -> FittedModel |
         return None
 
 
+def fitted_in_form(
+    fit: FittedModel, number: int, group: Sequence[Term], settings: NoiseSettings, rest: FittedModel | None
+) -> FittedModel | None:
+    """Return the fit with a size of each recording in place of an effect's common size, or the other way round.
+
+    From the present size and shape, and from the linear sizes without the effect: with a common size the fit can follow
+    one recording and take the others for outliers.
+
+    Args:
+        fit: with the effect.
+        number: of the effect.
+        group: the effect in the other form, with the shapes of its grid.
+        settings: of the noise.
+        rest: the fit without the effect, if it is known.
+    """
+    found = [_from_form(fit, number, group[0])]
+    if rest is not None:
+        found += [fitted_with(rest, addition) for addition in additions(rest, group, settings)]
+    fits = [other for other in found if other is not None]
+    return most_likely(fits) if fits else None
+
+
+def _from_form(fit: FittedModel, number: int, term: Term) -> FittedModel | None:
+    """Return the fit with an effect in another form, from its size and shape; None if it loses the recording."""
+    parts = list(fit.model.gammas(fit.parameters))
+    own, k = parts[number], len(term.effect.recordings or fit.model.terms[number].effect.recordings)
+    parts[number] = own.repeat_interleave(k) if term.effect.recordings else own.unflatten(0, (-1, k)).mean(-1)
+    terms = list(fit.model.terms)
+    terms[number] = replace(terms[number], effect=term.effect)
+    model = JointModel(fit.model.prepared, terms, fit.model.near)
+    start = torch.cat([fit.parameters[: fit.model.base], *parts])
+    try:
+        return shape_fitted(fitted(model, start, fit.bound, graduate=False, effort=SEARCH), SEARCH)
+    except NoFitError:
+        return None
+
+
 def fitted_simpler(fit: FittedModel, number: int) -> FittedModel | None:
     """Return the fit with the simpler form of an effect, such as equal exchange of two states; None without that."""
     start = simpler_start(fit, number) if fit.model.terms[number].effect.simpler is not None else None

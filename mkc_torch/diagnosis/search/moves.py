@@ -15,6 +15,7 @@ from mkc_torch.diagnosis.model.shapes import reach_of, within_a_sample
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import NoiseSettings
+from mkc_torch.effects.per_recording import PerRecording, is_relative
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
@@ -100,12 +101,13 @@ def additions(fit: FittedModel, terms: Sequence[Term], settings: NoiseSettings) 
 
     Args:
         fit: the model.
-        terms: candidates with the shapes of their grids; effects that the model has are left out, and those that act as
-            the model's parameters do, which would only undo the bounds of these.
+        terms: candidates with the shapes of their grids; effects that the model has are left out, with a common size or
+            a size of each recording, and those that act as the model's parameters do, which would only undo the bounds
+            of these.
         settings: which samples count.
     """
-    known = {term.key for term in fit.model.terms}
-    terms = [term for term in terms if term.key not in known]
+    known = {term.family for term in fit.model.terms}
+    terms = [term for term in terms if term.family not in known]
     if not terms:
         return []
     gains, sizes = linear_gains(fit, terms, settings)
@@ -121,6 +123,30 @@ def additions(fit: FittedModel, terms: Sequence[Term], settings: NoiseSettings) 
         starts = tuple((terms[numbers[k]], sizes[numbers[k]]) for k in best)
         found.append(Addition(starts, max(gains[n] for n in numbers)))
     return sorted(found, key=lambda addition: -addition.gain)
+
+
+def with_references(fit: FittedModel, terms: Sequence[Term], settings: NoiseSettings) -> tuple[Term, ...]:
+    """Return candidates with sizes relative to the first recording where a parameter acts as a common size does.
+
+    Args:
+        fit: the simulation alone.
+        terms: candidates with a common size and with a size for each recording.
+        settings: which samples count.
+    """
+    families = {term.family for term in terms if term.effect.recordings}
+    common = {term.family: term for term in terms if term.family in families and not term.effect.recordings}
+    if not common:
+        return tuple(terms)
+    gains, _ = linear_gains(fit, list(common.values()), settings)
+    same = {family for family, gain in zip(common, gains, strict=True) if gain == -math.inf}
+    forms: dict[int, PerRecording] = {}
+    for term in terms:
+        if term.family in same and isinstance(own := term.effect, PerRecording):
+            forms.setdefault(id(own), PerRecording(own.effect, own.recordings, own.of_run, relative=True))
+    return tuple(
+        replace(term, effect=forms[id(term.effect)]) if term.family in same and id(term.effect) in forms else term
+        for term in terms
+    )
 
 
 def at_size_zero(fit: FittedModel, group: Sequence[Term]) -> Addition:
@@ -206,7 +232,8 @@ def _longest_run(prepared: PreparedSimulation) -> float:
 def special_cases(term: Term, terms: Sequence[Term], prepared: PreparedSimulation) -> list[Term]:
     """Return the candidates that are a special case of an effect, or that it is one of, at the same channels.
 
-    Of a dependence on a column also its other forms, which have the same special case.
+    Of a dependence on a column also its other forms, which have the same special case. A common size is a special case
+    of a size for each recording.
     """
     channels = prepared.ports[term.port].channels
     found = []
@@ -217,6 +244,9 @@ def special_cases(term: Term, terms: Sequence[Term], prepared: PreparedSimulatio
         )
         if comes_by_exchange(term) and comes_by_exchange(other) and other.effect.id != term.effect.id:
             nested = nested or _special_id(other) == _special_id(term)
+        forms = other.family == term.family and other.key != term.key
+        # relative to a parameter of the simulation, which acts as the common size does
+        nested = nested or (forms and not (is_relative(term.effect) or is_relative(other.effect)))
         alike = other.columns == term.columns or not (other.columns and term.columns)
         if nested and prepared.ports[other.port].channels == channels and alike:
             found.append(other)
@@ -233,10 +263,11 @@ def comes_by_exchange(term: Term) -> bool:
 
 
 def one_form_each(found: Sequence[Addition], worth: Callable[[Addition], float]) -> list[Addition]:
-    """Return additions with one form of each dependence on a column: the first order, unless another is worth more.
+    """Return additions with one form of each effect: the first order of its dependence on a column, and a common size
+    for all recordings, unless another form is worth more.
 
-    Otherwise the forms of one dependence would take the places of other effects. A further form whose special case is
-    not among the additions comes only in exchange.
+    Otherwise the forms of one effect would take the places of other effects. A further form whose special case is not
+    among the additions comes only in exchange.
 
     Args:
         found: the additions.
@@ -249,7 +280,7 @@ def one_form_each(found: Sequence[Addition], worth: Callable[[Addition], float])
         families.setdefault((special.id if special else term.effect.id, *term.key[1:]), []).append(addition)
     chosen = []
     for key, members in families.items():
-        first = [addition for addition in members if addition.key == key]
+        first = [a for a in members if a.key == key] or [a for a in members if is_relative(a.starts[0][0].effect)]
         if first:
             best = max(members, key=worth)
             chosen.append(best if worth(best) > worth(first[0]) + _BETTER else first[0])

@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -22,8 +23,8 @@ def run_alone(kind: type[Dynamics], arguments: Sequence[str] | None = None) -> N
 
     Args:
         kind: class of the corrected simulation, with the fitted parameters.
-        arguments: of the command line: the recording, ``--start-seconds`` and ``--output``; None for those of the
-            process.
+        arguments: of the command line: the recording, ``--start-seconds``, ``--output``, and ``--sizes-of`` where
+            sizes differ between the diagnosed recordings; None for those of the process.
 
     Raises:
         SystemExit: wrong arguments (2), or a recording that cannot be simulated (1).
@@ -32,9 +33,15 @@ def run_alone(kind: type[Dynamics], arguments: Sequence[str] | None = None) -> N
     parser.add_argument("recording", metavar="NEW.csv", type=Path)
     parser.add_argument("--start-seconds", type=float, help="start from which the initial states are estimated")
     parser.add_argument("--output", type=Path, help="file for the simulated outputs, .csv or .parquet")
+    own: str | None = getattr(kind, "sizes_of", None)
+    if own is not None:
+        parser.add_argument("--sizes-of", default=own, help="diagnosed recording whose sizes apply")
     given = parser.parse_args(arguments)
     try:
-        found = predict(plain_model(kind()), Recording.read(given.recording, recognise=False), given.start_seconds)
+        system: Any = kind()
+        if own is not None:
+            system.sizes_of = given.sizes_of
+        found = predict(plain_model(system), Recording.read(given.recording, recognise=False), given.start_seconds)
         if given.output is not None:
             write_table(given.output, simulated_columns(found))
     except (ValueError, OSError) as error:

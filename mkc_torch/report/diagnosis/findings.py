@@ -11,6 +11,7 @@ from mkc_torch.diagnosis.environment import Grade, Run
 from mkc_torch.diagnosis.result import Alternative, CandidateScore, EffectParameter, Finding, Region
 from mkc_torch.diagnosis.vetoes import is_refused_by_blocks, refusal
 from mkc_torch.effects import is_curve, words_of
+from mkc_torch.effects.base import PER_RECORDING
 from mkc_torch.report.diagnosis.evidence import of_driver
 from mkc_torch.report.diagnosis.numbers import TimeFormat, curve_lines, largest, probability
 from mkc_torch.report.diagnosis.recordings import recording_called
@@ -338,7 +339,8 @@ def role(candidate: CandidateScore, findings: Sequence[Finding]) -> str:
     """Return the number of a candidate's finding, or whether it is distinguished from a finding."""
     own = candidate.effect, candidate.drivers
     for i, finding in enumerate(findings, 1):
-        if own == (finding.effect, finding.drivers) and _at(candidate.port, finding):
+        effects = finding.effect, f"{finding.effect}{PER_RECORDING}"
+        if candidate.effect in effects and candidate.drivers == finding.drivers and _at(candidate.port, finding):
             return f"finding {i}"
     for i, finding in enumerate(findings, 1):
         for a in finding.alternatives:

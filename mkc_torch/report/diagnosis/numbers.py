@@ -170,6 +170,8 @@ def parameter_lines(parameter: EffectParameter, channels: Sequence[str]) -> list
         ...     EffectParameter("jumps", (11.2, -1.2), (4.4, 0.6), "°", ("at 61.1 s", "at 103.2 s")), ("heading",)
         ... )
         ['at 61.1 s: 11.2 ± 4.4 °', 'at 103.2 s: −1.2 ± 0.6 °']
+        >>> parameter_lines(EffectParameter("drag", 0.5, 0.1, "1/m", ("b",)), ("rate of speed",))
+        ['b: 0.50 ± 0.10 1/m']
         >>> parameter_lines(EffectParameter("lag", 1.5, None, "s"), ("x",))
         ['1.50 s, standard error not estimated']
     """
@@ -185,7 +187,7 @@ def _listed(parameter: EffectParameter) -> list[str]:
     """Format each number of a list with its component name, in common digits and a common power of ten."""
     p = parameter
     (values,) = _rows(p.value)
-    errors = next(_rows(p.standard_error)) if isinstance(p.standard_error, Sequence) else [math.nan] * len(values)
+    errors = [math.nan] * len(values) if p.standard_error is None else next(_rows(p.standard_error))
     digits = _Digits.of([values], [errors])
     cells = [digits.cell(v, e) for v, e in zip(values, errors, strict=True)]
     tail = digits.factor + (f" {plain(p.unit)}" if p.unit else "")

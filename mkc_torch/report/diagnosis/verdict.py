@@ -261,7 +261,10 @@ def apply_command(diagnosis: Diagnosis, paths: RunPaths | None = None) -> str:
         "simulated": " --simulator-output NEW_SIM.csv --output corrected.csv",
     }.get(d.simulation, f" --simulation FILE.py:{plain(d.simulation) or 'CLASS'} --output simulated.csv")
     if paths is None:
-        return f"mkc apply model.json NEW.csv{own}"
+        sizes = next(
+            (f" --sizes-of {shlex.quote(f.recordings[0])}" for f in d.findings if f.recordings and transfers(f)), ""
+        )
+        return f"mkc apply model.json NEW.csv{own}{sizes}"
     output = "corrected.csv" if d.simulation in ("magnetometer", "simulated") else "simulated.csv"
     options = " ".join(map(shlex.quote, (*paths.options, "--output", output)))
     return f"mkc apply {shlex.quote(paths.model)} {shlex.quote(paths.recording)} {options}"

@@ -81,7 +81,7 @@ def strong_observer(
         shortest: compute that unit without growth of the states, also used where growth would overflow.
 
     Returns:
-        The observer; None where process noise moves no output, or numbers overflow.
+        The observer; None where process noise moves no output, or numbers overflow or are lost by rounding.
     """
     flow = flow_along(prepared, theta, prepared.guess)
     if not all(bool(np.isfinite(matrices).all()) for matrices in (flow.transition, flow.noise_input, flow.seen)):
@@ -107,7 +107,8 @@ def strong_observer(
                 if disturbances
                 else None
             )
-    except FloatingPointError:  # unstable states overflow between two samples
+    # unstable states overflow between two samples, or lose the positive covariance of their prediction by rounding
+    except (FloatingPointError, np.linalg.LinAlgError):
         return None
 
 

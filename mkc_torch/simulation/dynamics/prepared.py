@@ -48,7 +48,15 @@ _PATIENT = 2
 
 
 class PreparedDynamics(CheckedDynamics):
-    """A system of differential equations with its recording; implements the protocol of a prepared simulation."""
+    """A system of differential equations with its recording; implements the protocol of a prepared simulation.
+
+    Attributes:
+        recordings: names of the recordings that are diagnosed together; empty for a single recording.
+        of_run: (K,), number of the recording of each run; empty for a single recording.
+    """
+
+    recordings: tuple[str, ...] = ()
+    of_run: Int[Tensor, " K"] = torch.zeros(0, dtype=torch.long)
 
     def __init__(self, system: Equations, recording: Recording, outputs: tuple[str, ...]) -> None:
         self.system, self.whole, self.channels = system, recording, outputs
@@ -170,7 +178,10 @@ class PreparedDynamics(CheckedDynamics):
         near = self.trajectory(theta, {})
         tangents = torch.func.jacfwd(dual_constants(lambda values: self.residual(values, {}, near)))(theta)
         system = equations_with_offsets(self.system, self.channels, self.run, tangents, recording, names)
-        return self if system is None else PreparedDynamics(system, self.whole, self.channels)
+        other = copy.copy(self) if system is None else PreparedDynamics(system, self.whole, self.channels)
+        other.recordings = tuple(names)
+        other.of_run = recording.new_zeros(int(self.run.max()) + 1).scatter(0, self.run, recording)
+        return other
 
     @cached_property
     def ports(self) -> dict[str, Port]:

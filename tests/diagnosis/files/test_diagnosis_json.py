@@ -104,6 +104,14 @@ def test_region_and_shares_of_runs_are_written_if_known():
     assert "experiments" not in without
 
 
+def test_recordings_with_a_size_of_their_own_are_written():
+    drag = EffectParameter("drag", (0.01, 0.02), (0.001, 0.001), "1/m", ("a", "b"))
+    (finding,) = written(with_finding(make_diagnosis(1), parameters=(drag,), recordings=("a", "b")))["findings"]
+    assert finding["recordings"] == ["a", "b"]
+    assert finding["parameters"][0]["components"] == ["a", "b"]
+    assert "recordings" not in written(make_diagnosis(1))["findings"][0]
+
+
 def test_the_driver_shift_is_written():
     (finding,) = written(with_finding(make_diagnosis(1), timing.driver_shift_result(DriverShift(38, 2, 22.5))))[
         "findings"

@@ -147,7 +147,7 @@ def test_an_offset_equivalent_to_an_initial_state_is_not_fitted():
         Recording({**part.columns, "way": part["speed"].cumsum(0) / 20.0}, name=part.name) for part in recordings
     ]
     prepared = Way().prepare(joined(Way(), recordings)[0])
-    assert with_own_offsets(prepared, recordings) is prepared
+    assert with_own_offsets(prepared, recordings).system is prepared.system
 
 
 def test_offsets_are_per_recording_not_per_run():
