@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from mkc_torch.simulation import Simulation
 
 _EXPERIMENT = "experiment"
-WRITTEN = ("diagnosis.json", "model.json", "corrected.py", "report.html")
+WRITTEN = ("diagnosis.json", "model.json", "corrected.py", "corrected.xml", "report.html")
 
 
 def diagnose_file(
@@ -159,7 +159,8 @@ def write_diagnosis(
 ) -> list[Path]:
     """Write diagnosis.json, model.json and report.html into a folder.
 
-    Differential equations also get corrected.py, the simulation with the findings. ``note`` is shown in the report.
+    Differential equations also get corrected.py, the simulation with the findings, and a model of MuJoCo also
+    corrected.xml. ``note`` is shown in the report.
     """
     from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
     from mkc_torch.report import diagnosis_report
@@ -169,7 +170,9 @@ def write_diagnosis(
         texts["model.json"] = diagnosis.model.to_json()
         with suppress(SourceError):
             texts["corrected.py"] = diagnosis.model.to_python(folder=folder)
-    for name in {"model.json", "corrected.py"} - set(texts):
+        with suppress(SourceError):
+            texts["corrected.xml"] = diagnosis.model.to_mjcf()[0]
+    for name in {"model.json", "corrected.py", "corrected.xml"} - set(texts):
         (folder / name).unlink(missing_ok=True)  # a file of an earlier diagnosis
     if report:
         texts["report.html"] = diagnosis_report(diagnosis, note=note, paths=paths)
@@ -241,15 +244,19 @@ def _paths(path: Path, folder: Path, request: Request) -> RunPaths | None:
     return RunPaths(str(path), str(folder / "model.json"), tuple(options))
 
 
-def named_simulation(name: str) -> Simulation:
-    """Return the magnetometer, or load the user's simulation ``FILE.py:NAME``.
+def named_simulation(name: str, fitted: Sequence[str] = ()) -> Simulation:
+    """Return the magnetometer, or load the user's simulation.
+
+    Args:
+        name: as for ``--simulation``.
+        fitted: for a model of MuJoCo, patterns of the numbers to fit; empty for those that the file gives.
 
     Raises:
         SimulationFileError: the file cannot be used.
     """
     from mkc_torch.simulation import Magnetometer
 
-    return Magnetometer() if name == MAGNETOMETER else load_simulation(name)
+    return Magnetometer() if name == MAGNETOMETER else load_simulation(name, fitted)
 
 
 def paired_simulation(path: Path, columns: Mapping[str, str]) -> Simulation:
@@ -273,7 +280,7 @@ def simulation_of(request: Request) -> Simulation:
     """
     if request.simulator_output is not None:
         return paired_simulation(request.simulator_output, request.columns)
-    return named_simulation(request.simulation)
+    return named_simulation(request.simulation, request.fit)
 
 
 def _failed(path: Path, label: str, error: Exception) -> Outcome:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from mkc_torch.diagnosis.declared import checked_input_hold
+from mkc_torch.diagnosis.io.mjcf import mjcf_source
 from mkc_torch.diagnosis.io.python_source import SourceError, python_source
 from mkc_torch.diagnosis.io.training import Training
 from mkc_torch.diagnosis.model.fit import FittedModel
@@ -29,6 +30,7 @@ from mkc_torch.simulation.magnetometer import Magnetometer
 from mkc_torch.simulation.paired import Paired
 from mkc_torch.simulation.ports import Change, Changes
 from mkc_torch.simulation.protocol import CorrectableSimulation, Correction, PreparedSimulation, Simulation
+from mkc_torch.simulation.stepped.mujoco import MujocoStepper
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -221,6 +223,16 @@ class DiagnosedModel(CorrectingModel):
         return python_source(
             system, self.theta.tolist(), self.terms, tuple(self.gammas), measured, holds, module, folder
         )
+
+    def to_mjcf(self) -> tuple[str, tuple[str, ...]]:
+        """Return a MuJoCo model's file with the fitted numbers and findings, and the findings that it cannot express.
+
+        Raises:
+            SourceError: the simulation is no MuJoCo model.
+        """
+        if not isinstance(self.source, MujocoStepper):
+            raise SourceError(f'Only a MuJoCo model can be exported as MJCF, but the model is of "{self.simulation}".')
+        return mjcf_source(self.source, self.theta.tolist(), self.terms, tuple(self.gammas))
 
     @staticmethod
     def from_json(
