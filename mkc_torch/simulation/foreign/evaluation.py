@@ -47,10 +47,23 @@ class EvaluationPoints:
             alike &= (self.parts[k] == other.parts[k]).all(1)
         return alike
 
+    def near(self, other: EvaluationPoints, share: float) -> bool:
+        """Whether all points are those of ``other`` within a share of the size of each column and parameter."""
+        pairs = zip(self.parts[1:], other.parts[1:], strict=True)
+        return all(
+            own.shape == known.shape and bool((np.abs(own - known) <= share * _size(known)).all())
+            for own, known in pairs
+        )
+
     def rows(self, which: Any) -> tuple[Array, Array, Array]:
         """Times, states and inputs of some of the points."""
         time, states, inputs, _ = self.parts
         return tuple(np.ascontiguousarray(part[which]) for part in (time, states, inputs))  # type: ignore[return-value]
+
+
+def _size(values: Array) -> Array:
+    """Root mean square of each column of a table; the size of each value of a list."""
+    return np.abs(values) if values.ndim == 1 else np.sqrt(np.square(values).mean(0))
 
 
 class CachedEvaluation:
