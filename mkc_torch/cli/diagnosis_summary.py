@@ -12,7 +12,7 @@ from rich.text import Text
 from mkc_torch._support.typesetting import plain, typeset
 from mkc_torch.cli.remarks import note_rows, warning_rows
 from mkc_torch.diagnosis.result import Diagnosis, Finding
-from mkc_torch.diagnosis.verdict import Status
+from mkc_torch.diagnosis.verdict import Answer
 from mkc_torch.report.diagnosis import before_search, environment, noise, numbers, unseen, untested
 from mkc_torch.report.diagnosis import findings as sentences
 from mkc_torch.report.diagnosis import verdict as top
@@ -26,7 +26,8 @@ _MOST_LINES = 6
 
 _REPORT = "report.html"
 
-_STYLE: dict[Status, str] = {"good": "bold green", "found": "bold cyan", "faint": "bold", "open": "bold yellow"}
+_STYLE: dict[Answer, str] = {"usable": "bold green", "look": "bold yellow", "unusable": "bold red"}
+"""Style of the headline."""
 
 
 def show(console: Console, diagnosis: Diagnosis, files: list[Path], paths: top.RunPaths | None = None) -> None:
@@ -39,7 +40,7 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path], paths: top.R
     console.print(Text(heading, style="bold"))
     for notice in top.notices_first(d):
         console.print(Text(notice, style="bold yellow"))
-    console.print(Text(top.headline(d), style=_STYLE[top.status(d)]))
+    console.print(Text(top.headline(d), style=_STYLE[top.answer_word(d)]))
     if d.checks:
         console.print(Text(before_search.TITLE, style="bold"))
         console.print(_facts(("parameter", line) for line in before_search.check_lines(d)))
@@ -47,7 +48,7 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path], paths: top.R
     for i, finding in enumerate(d.findings, 1):
         if len(d.findings) > 1:
             console.print(Text(f"{i}  {_graded(finding)}", style="bold"))
-        console.print(_facts(_of_finding(finding, d, first=i == 1)))
+        console.print(_facts(_of_finding(finding, d)))
     if d.too_few:
         console.print(_facts(("candidate", untested.candidate_line(one)) for one in untested.strongest(d)))
     console.print(_facts(_of_all(d, console.width - _LABEL - 3)))
@@ -87,12 +88,14 @@ def _graded(finding: Finding) -> str:
     return f"{sentences.finding_name(finding)}: {sentences.grade(finding)}"
 
 
-def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Iterator[tuple[str, str]]:
+def _of_finding(finding: Finding, diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     f = finding
-    lines = [line for p in f.parameters for line in numbers.named_lines(p, f.channels)]
+    parameters = sentences.stated_parameters(f)
+    lines = [line for p in parameters for line in numbers.named_lines(p, f.channels)]
     if len(lines) > _MOST_LINES:
-        lines = [numbers.largest(p) for p in f.parameters[:_MOST_LINES]]
+        lines = [numbers.largest(p) for p in parameters[:_MOST_LINES]]
         lines.append("further parameters: see the report")
+    lines += sentences.curve_values(f)
     if lines:
         yield "size", "\n".join(filter(None, [*lines, numbers.at_input(f.at_input)]))
     acts = f"; {sentences.acts_on(f)}" if f.channels else ""
@@ -110,10 +113,9 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
     if f.held_out is None:
         yield "held out", f"not measured: {plain(f.held_out_note)}"
     else:
-        zero = "; 0 is no improvement" if first else ""
         residual = "; ".join(unseen.residuals(f.held_out, diagnosis.environment))
         more = [unseen.diverged(f.held_out), plain(f.held_out_note)]
-        change = f"{residual}; {unseen.better(f.held_out)}; {numbers.gain(f.held_out)}{zero}"
+        change = f"{residual}; {unseen.better(f.held_out)}"
         yield "held out", "\n".join(filter(None, [change, *more]))
     yield from rows(f.evidence, terminal=True)
     if sentences.inseparable(f):

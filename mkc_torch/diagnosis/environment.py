@@ -20,7 +20,7 @@ Grade = Literal["left_out", "small", "unconfirmed", "nearest"]
 class Curve:
     """An effect against its driver, one row per point, one column per channel.
 
-    ``band`` is the half-width of a 95 % interval.
+    ``band`` is the half-width of a 95 % interval. Both are NaN where a free curve has no samples near.
     """
 
     driver: str

@@ -13,7 +13,7 @@ from mkc_torch.diagnosis.environment import Curve, Grade, ShapeCheck
 from mkc_torch.effects.kinds import Kind
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float, Int
 
 Number = float | tuple["Number", ...]
 
@@ -311,13 +311,26 @@ class NoiseSummary:
 
 
 @dataclass(frozen=True)
+class OutputSize:
+    """Size of an output's residual on held-out blocks: a robust root mean square, in the output's own unit."""
+
+    rmse: float
+    unit: str
+
+
+@dataclass(frozen=True)
 class HeldOutScore:
-    """A model on held-out blocks: log-likelihood in nats per sample, root mean square over the common inliers."""
+    """A model on held-out blocks: log-likelihood in nats per sample, root mean square over the common inliers.
+
+    ``outputs`` has the size of each output's residual, over the blocks in which no compared model diverges; empty if
+    that is unknown.
+    """
 
     log_likelihood: float
     rmse: float
     sigma: tuple[float, ...]
     d: tuple[float, ...]
+    outputs: Mapping[str, OutputSize] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -366,8 +379,35 @@ class Separability:
 
 
 @dataclass(frozen=True)
+class Courses:
+    """The recording and both simulations over time, one row per sample in use.
+
+    Attributes:
+        recorded: the outputs; NaN where one is missing.
+        before: the simulation without findings; in held-out samples that of a fit which has not used them.
+        corrected: the same with the findings that count.
+        held_out: True for the samples of one fold of the held-out blocks; all False if no blocks are held out.
+        run: number of each sample's run, ascending.
+        one_step: whether the simulations predict each sample from the samples before it, because no open-loop
+            simulation follows the recording.
+    """
+
+    recorded: Float[Tensor, "N m"]
+    before: Float[Tensor, "N m"]
+    corrected: Float[Tensor, "N m"]
+    held_out: Bool[Tensor, " N"]
+    run: Int[Tensor, " N"]
+    one_step: bool = False
+
+
+@dataclass(frozen=True)
 class Traces:
-    """The series that the report draws, one row per sample in use."""
+    """The series that the report draws, one row per sample in use.
+
+    ``before`` and ``after`` are residuals without findings and with those that count; ``with_all`` is that with all
+    findings, None if all count. ``courses`` is None if the residual is not that of a recorded column, such as the
+    length of a magnetometer's field.
+    """
 
     time: Float[Tensor, " N"]
     has_time: bool
@@ -378,3 +418,5 @@ class Traces:
     unit: str
     drivers: Mapping[str, Float[Tensor, " N"]] = field(default_factory=dict)
     driver_units: Mapping[str, str] = field(default_factory=dict)
+    with_all: Float[Tensor, "N m"] | None = None
+    courses: Courses | None = None

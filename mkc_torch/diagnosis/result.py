@@ -79,9 +79,9 @@ __all__ = [
 ]
 
 _QUICK = (
-    "Quick look: no p-values, false-alarm rate not controlled. Left out: surrogates, fits from further starts, slow "
-    "tests of evidence, and the states and runs in which an effect gains; for differential equations also unseen "
-    "blocks, shapes and further findings. Leave out --quick (in Python quick=True) to have all."
+    "Quick look: no p-values, false-alarm rate not controlled. Left out: the test against chance, fits from further "
+    "starts, slow tests of evidence, and the states and runs in which an effect gains; for differential "
+    "equations also unseen blocks, shapes and further findings. Leave out --quick (in Python quick=True) to have all."
 )
 
 
@@ -199,7 +199,7 @@ class Diagnosis:
             before it was known.
         verdict: "unfit", "adequate", "explained" or "unexplained".
         findings: strongest first.
-        baseline, corrected: scores of the simulation without and with the findings, on held-out blocks.
+        baseline, corrected: scores of the simulation without findings, and with those that count, on held-out blocks.
         advice: what to do or to record next, in sentences that name effects by their ids.
         warnings: sentences of the same form.
         notes: how the recording was read, a sentence each.

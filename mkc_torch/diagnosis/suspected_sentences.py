@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 
 from mkc_torch._support.unit_text import sized
 from mkc_torch.diagnosis.decisions import ScoredModel, Trail
+from mkc_torch.effects import is_curve
 
 _SAME = 0.05
 """Difference of two scores in nats below which they are printed as equal."""
@@ -24,7 +25,7 @@ def suspected_sentences(trail: Trail, units: Mapping[str, str], *, findings: boo
         >>> alone = ScoredModel((), "", 800.0, {}, "white", {"speed": 0.3})
         >>> drag = ScoredModel(("drag@speed",), "suspected", 812.3, {}, "white", {"speed": 0.0139}, suspected=True)
         >>> suspected_sentences(Trail((alone, drag)), {"speed": "m/s"}, findings=False)
-        ('The suspected drag@speed scores 12.3 nats more than the simulation alone; it leaves 0.0139 m/s.',)
+        ('The suspected drag@speed scores 12.3 more than the simulation alone; it leaves 0.0139 m/s.',)
     """
     found = next((model for model in trail.models if model.chosen), None) if findings else None
     alone = next((model for model in trail.models if not model.terms), None)
@@ -43,7 +44,7 @@ def _sentences(model: ScoredModel, other: ScoredModel | None, name: str, units: 
         f"{' '.join([parameter.name.replace('_', ' '), sized(parameter.value, parameter.unit)])} of {term}"
         for term, parameters in zip(model.terms, model.parameters, strict=False)
         for parameter in parameters
-        if isinstance(parameter.value, float) and math.isfinite(parameter.value)
+        if isinstance(parameter.value, float) and math.isfinite(parameter.value) and not _of_curve(term)
     ]
     if sizes:
         yield f"Its sizes: {', '.join(sizes)}."
@@ -51,17 +52,22 @@ def _sentences(model: ScoredModel, other: ScoredModel | None, name: str, units: 
 
 def _comparison(score: float, model: ScoredModel, other: ScoredModel | None, name: str) -> str:
     if other is None or other.score is None:
-        return f"scores {score:.1f} nats, and {name} has no score"
+        return f"scores {score:.1f}, and {name} has no score"
     difference = score - other.score
     if sorted(model.terms) == sorted(other.terms) and abs(difference) < 0.5:
         return "is what was found"
     if abs(difference) < _SAME:
         return f"scores as much as {name}"
-    return f"scores {_nats(abs(difference))} {'more' if difference > 0.0 else 'less'} than {name}"
+    return f"scores {_difference(abs(difference))} {'more' if difference > 0.0 else 'less'} than {name}"
 
 
-def _nats(value: float) -> str:
-    return f"{value:.3g} nats" if value < 100.0 else f"{value:.0f} nats"
+def _of_curve(term: str) -> bool:
+    """Whether a term is a curve: its coefficients are no values of it."""
+    return is_curve(term.partition("@")[0])
+
+
+def _difference(value: float) -> str:
+    return f"{value:.3g}" if value < 100.0 else f"{value:.0f}"
 
 
 def _left(model: ScoredModel, units: Mapping[str, str]) -> str:

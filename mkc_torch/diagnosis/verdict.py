@@ -20,11 +20,6 @@ from mkc_torch.diagnosis.thresholds import LOST, MUCH_REJECTED
 from mkc_torch.diagnosis.vetoes import grade, is_dropped
 from mkc_torch.simulation.dynamics.noise import StateSpaceNoise
 
-Status = Literal["good", "found", "faint", "open"]
-"""Of a headline. ``good``: nothing is missing. ``found``: named physics is missing. ``faint``: nothing is worth
-correcting. ``open``: a poor fit, unnamed structure, or another doubt.
-"""
-
 Answer = Literal["usable", "look", "unusable"]
 """``usable``: the simulation can be used, corrected by the findings. ``look``: a person has to look at the doubts.
 ``unusable``: the simulation does not fit the recording.
@@ -272,13 +267,11 @@ def rejected_share(diagnosis: Diagnosis) -> float:
 
 
 def _residual_ratio(diagnosis: Diagnosis) -> float:
-    """Return the smallest ratio of an output's residuals with and without the findings; NaN if unknown."""
+    """Return the smallest ratio of an output's residuals with and without the findings that count; NaN if unknown."""
     d = diagnosis
-    held = [f.held_out for f in d.findings if f.held_out is not None]
-    pairs = [(d.baseline.rmse, d.corrected.rmse)]
-    if held and held[0].outputs and held[-1].outputs:
-        last = held[-1].outputs
-        pairs = [(sizes.before, last[name].after) for name, sizes in held[0].outputs.items() if name in last]
+    before, after = d.baseline.outputs, d.corrected.outputs
+    pairs = [(before[name].rmse, after[name].rmse) for name in before if name in after]
+    pairs = pairs or [(d.baseline.rmse, d.corrected.rmse)]
     if any(not math.isfinite(before) for before, _ in pairs):
         return math.nan
     return min((after / before if before > 0.0 else math.inf for before, after in pairs), default=math.inf)
@@ -353,15 +346,6 @@ class Conclusion:
         """Whether a command ends with the exit status of a doubtful result."""
         return self.answer != "usable"
 
-    @property
-    def status(self) -> Status:
-        """Status of the headline; "open" for each doubtful result, and for no other."""
-        if self.doubts:
-            return "open"
-        if "left_out" in self.grades:
-            return "found"
-        return "faint" if self.grades or self.verdict == "explained" else "good"
-
     def first_advice(self, *, quick: bool = False, reasons: bool = False) -> str:
         """Return the first sentence of the advice; empty if it follows from the findings and the remaining structure.
 
@@ -377,8 +361,12 @@ class Conclusion:
         if self.check:
             return self.check
         if quick and self.grades:
-            return "Confirm it by a full diagnosis."  # a quick look tests no held-out blocks
-        return "The simulation can be used within the range of this recording." if self.verdict == "adequate" else ""
+            return "Confirm this by a full diagnosis."  # a quick look leaves tests out
+        if self.verdict != "adequate":
+            return ""
+        if self.doubts:
+            return "Find out why so many samples were rejected before the simulation is used."
+        return "The simulation can be used within the range of this recording."
 
 
 def conclude(

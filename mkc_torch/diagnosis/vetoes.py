@@ -198,6 +198,37 @@ def grade(decisions: Sequence[Decision]) -> Grade:
     return next((found for found in _WORST_FIRST if found in lowered), "left_out")
 
 
+_BLOCKS = "held-out blocks do not confirm it"
+
+_REFUSALS: Mapping[str, str] = MappingProxyType(
+    {
+        "held_out_blocks": _BLOCKS,
+        "open_loop": "the open-loop residual on held-out blocks is not clearly smaller with it",
+        "visible": "the compared length hardly shows it",
+        "p_value": "its p-value is above the level",
+    }
+)
+"""Why a finding is unconfirmed, by the failed rule; the first that fails is stated."""
+
+
+def refusal(finding: Finding) -> str:
+    """Return why a finding is unconfirmed, as a clause.
+
+    Example:
+        >>> untested = Finding("linear_drag", (), ("rate of speed",), (), None, "", "", (), 0.2, (), True, "")
+        >>> refusal(untested)
+        'its p-value is above the level'
+    """
+    failed = {decision.rule for decision in decisions_on(finding) if not decision.passed}
+    text = next((text for rule, text in _REFUSALS.items() if rule in failed), "")
+    return text or (_BLOCKS if finding.held_out is not None else "it was not tested on held-out blocks")
+
+
+def is_refused_by_blocks(finding: Finding) -> bool:
+    """Whether held-out blocks are the reason why a finding is unconfirmed."""
+    return "held-out blocks" in refusal(finding) and finding.held_out is not None
+
+
 def is_dropped(decisions: Sequence[Decision]) -> bool:
     """Whether a candidate is no finding at all: its size is 0 within its standard error."""
     return any(decision.rule == "size_beyond_error" and not decision.passed for decision in decisions)
@@ -251,6 +282,12 @@ def is_small(finding: Finding) -> bool:
 def worth_correcting(finding: Finding) -> bool:
     """Whether the finding clearly improves the simulation."""
     return finding.grade == "left_out"
+
+
+def counts(finding: Finding) -> bool:
+    """Whether a finding belongs into the corrected model: confirmed, or not tested and of a possible size."""
+    untested = finding.held_out is None and not finding.cannot_be
+    return finding.grade != "unconfirmed" or untested
 
 
 def transfers(finding: Finding) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from html import escape
 from typing import Any, NamedTuple
 
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from mkc_torch.report.drawing import svg
@@ -46,11 +47,80 @@ class Panels:
 
     def markup(self, name: str, description: str) -> str:
         """Return the panels as HTML; ``name`` begins the ids, ``description`` is read aloud with each title."""
+        for ax in self._axes:
+            with_room_for_labels(ax.figure)
         drawn = (
             svg(ax.figure, f"{name}-{i}", escape(": ".join(filter(None, (description, ax.get_title(loc="left"))))))
             for i, ax in enumerate(self._axes, 1)
         )
         return f'<div class="panels in{self._columns}">{"".join(drawn)}</div>'
+
+
+_EDGE = 2.0
+"""Least distance of a label from the edge of its figure, in points."""
+
+_FEWEST_LETTERS = 4
+"""Letters that are left of a label that is too long."""
+
+
+def with_room_for_labels(figure: Figure) -> None:
+    """Move the edges of the axes, and shorten labels, until no label is cut at the edge of the figure.
+
+    A label of the y axis is as long as the axes are high, or as the figure where it is the only one.
+    """
+    canvas = FigureCanvasAgg(figure)
+    renderer = canvas.get_renderer()
+    scale, axes = figure.dpi / 72.0, [ax for ax in figure.axes if ax.get_visible()]
+    column = all(_in_one_column(axes[0], ax) for ax in axes)
+    missing, beyond = 0.0, 0.0
+    for ax in axes:
+        label = ax.yaxis.label
+        alone = sum(bool(other.get_ylabel()) for other in axes if _in_one_column(ax, other)) == 1
+        room = figure.bbox.height if alone else ax.get_window_extent(renderer).height * 1.1
+        _shorten(label, room - 2.0 * _EDGE * scale, lambda label=label: label.get_window_extent(renderer).height)
+        _shorten(ax.xaxis.label, figure.bbox.width, lambda ax=ax: ax.xaxis.label.get_window_extent(renderer).width)
+        box = ax.yaxis.get_tightbbox(renderer)
+        if box is not None and str(ax.yaxis.get_label_position()) == "left":
+            missing = max(missing, _EDGE * scale - box.x0)
+        ticks = ax.xaxis.get_tightbbox(renderer)
+        if ticks is not None and column:
+            beyond = max(beyond, ticks.x1 - figure.bbox.width + _EDGE * scale)
+        if alone and box is not None and label.get_text():
+            _centre(ax, renderer)
+    if missing > 0.0 or beyond > 0.0:
+        left, right = missing / figure.bbox.width, beyond / figure.bbox.width
+        for ax in axes:
+            place = ax.get_position()
+            ax.set_position((place.x0 + left, place.y0, place.width - left - right, place.height))
+
+
+def _in_one_column(ax: Any, other: Any) -> bool:
+    return bool(abs(ax.get_position().x0 - other.get_position().x0) < 1e-6)
+
+
+def _shorten(label: Any, room: float, size: Any) -> None:
+    """Cut the name in a label, before its unit in parentheses, until it fits into the room in pixels.
+
+    A label whose unit alone is too long gets smaller letters.
+    """
+    text = label.get_text()
+    while text and size() > room:
+        name, opened, unit = text.rpartition(" (")
+        name, unit = (name, f"{opened}{unit}") if opened else (unit, "")
+        if len(name) <= _FEWEST_LETTERS:
+            label.set_fontsize(label.get_fontsize() * room / size())
+            return
+        text = f"{name.removesuffix('…')[:-1]}…{unit}"
+        label.set_text(text)
+
+
+def _centre(ax: Any, renderer: Any) -> None:
+    """Move a label that is longer than its axes along the edge, so that both its ends are inside the figure."""
+    label = ax.yaxis.label
+    box = label.get_window_extent(renderer)
+    moved = max(_EDGE - box.y0, 0.0) - max(box.y1 - ax.figure.bbox.height + _EDGE, 0.0)
+    if moved:
+        label.set_y(label.get_position()[1] + moved / ax.get_window_extent(renderer).height)
 
 
 def title(ax: Any, text: str, *, above: bool = False) -> None:

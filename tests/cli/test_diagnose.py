@@ -19,7 +19,8 @@ from mkc_torch._support import files as _files
 from mkc_torch.cli import diagnosis_files
 from mkc_torch.cli.console import ConsoleStyle
 from mkc_torch.cli.diagnose import _waited_for
-from mkc_torch.diagnosis import DiagnosedModel
+from mkc_torch.diagnosis import DiagnosedModel, vetoes
+from mkc_torch.diagnosis.decisions import Decision
 from mkc_torch.diagnosis.io.diagnosis_json import validate
 from mkc_torch.recording.recording import Recording, write_table
 from tests.cli.commands import assert_refused, mkc
@@ -101,6 +102,25 @@ def test_diagnose_writes_its_files_and_a_summary(step_diagnosis):
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert page.startswith("<!doctype html>")
     assert "hard-iron step" in page
+
+
+def test_an_unconfirmed_finding_is_in_no_corrected_number_of_any_file(tmp_path, monkeypatch):
+    def refused(finding, context):
+        return Decision("held_out_blocks", "", 0.0, 1.0, False, "Refused.", context.number)
+
+    monkeypatch.setattr(vetoes, "VETOES", (refused,))
+    path = table(tmp_path / "stepped.csv", sensor_columns(STEPPED, step=1.0))
+    result = diagnose_magnetometer(path, "--output", tmp_path / "out")
+    assert result.exit_code == 3, result.output
+    folder = tmp_path / "out" / "stepped"
+    content = content_of(folder)
+    assert [finding["grade"] for finding in content["findings"]] == ["unconfirmed"]
+    assert content["corrected"] == content["baseline"]
+    assert json.loads((folder / "model.json").read_text(encoding="utf-8"))["effects"] == []
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert "with the findings" not in page
+    assert "Residual of the fitted simulation" in page
+    assert "leaves out <code>hard_iron_step</code>: not confirmed" in page
 
 
 def test_the_model_corrects_a_second_recording(step_diagnosis, tmp_path):

@@ -17,6 +17,7 @@ from mkc_torch.diagnosis.environment import (
 )
 from mkc_torch.diagnosis.evidence import prediction, remaining
 from mkc_torch.diagnosis.findings.advice import advice_of
+from mkc_torch.diagnosis.parts import Courses
 from mkc_torch.diagnosis.result import (
     Alternative,
     CandidateScore,
@@ -207,6 +208,17 @@ def make_traces(findings, channels, samples, has_time):
         drivers=drivers,
         driver_units={"current": "A", "temperature": "°C"},
     )
+
+
+def with_courses(diagnosis, *, runs=1, held_out=True, one_step=False):
+    """Return the diagnosis with a recording of its channels, from which its residuals are."""
+    t = diagnosis.traces
+    share = torch.arange(len(t.time), dtype=torch.float64).unsqueeze(-1) / max(len(t.time), 1)
+    recorded = 20.0 * torch.sin(25.0 * share + torch.arange(len(t.channels))) + 5.0
+    run = (share.squeeze(-1) * runs).long()
+    fold = (share.squeeze(-1) * 25).long() % 5 == 2
+    courses = Courses(recorded, recorded - t.before, recorded - t.after, fold & held_out, run, one_step)
+    return dataclasses.replace(diagnosis, traces=dataclasses.replace(t, courses=courses))
 
 
 def make_candidates(count):

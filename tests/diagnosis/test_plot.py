@@ -105,7 +105,10 @@ def test_the_candidates_plot_has_bars_of_gains_in_the_order_of_the_search(found)
         (lambda d: d.plot.forcing(5), "`index`.*5"),
         (lambda d: d.plot.candidates(0), "`most` to be at least 1 but got 0"),
         (lambda d: d.plot.separability(0), "`most` to be at least 1 but got 0"),
-        (lambda d: dataclasses.replace(d, findings=()).plot.residual(corrected=True), "`corrected`.*no findings"),
+        (
+            lambda d: dataclasses.replace(d, findings=()).plot.residual(corrected=True),
+            "`corrected`.*no finding that counts",
+        ),
         (lambda d: dataclasses.replace(d, findings=()).plot.effect(), "no finding was made"),
         (lambda d: dataclasses.replace(d, findings=()).plot.held_out(), "No finding has a gain"),
         (lambda d: dataclasses.replace(d, candidates=()).plot.candidates(), "no candidates"),

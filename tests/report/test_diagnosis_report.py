@@ -116,19 +116,26 @@ def test_an_explained_diagnosis_states_effect_time_evidence_and_improvement():
     assert "Left out of the simulation: hard-iron step." in text
     assert "offset change (3.214 ± 0.081, −1.104 ± 0.077, 0.325 ± 0.092) µT; onset 41.32 ± 0.14 s" in text
     assert "From 41.3 s on; acts on mag_x, mag_y, mag_z." in text
-    assert "p = 0.005 (the minimum with 199 surrogates)" in text
+    assert "p = 0.005 or less, corrected for 64 candidates (level 0.05)." in text
     assert "On held-out data: residual 0.912 → 0.521 µT (43 % less)." in text
     assert "If it is hard-iron step: look for what changed at that time; use the calibration from after the" in text
-    assert (
-        "residual 0.912 → 0.521 µT (43 % less) surely better on held-out blocks; +0.312 nats per sample (95 %: " in text
-    )
-    assert "offset drift 41.2 yes" in text
+    assert "residual 0.912 → 0.521 µT (43 % less) surely better on held-out blocks" in text
+    assert "hard-iron step +0.312 nats per sample (95 %: 0.281 to 0.350) not tested not tested" in text
+    assert "p-values come from 199 surrogates" in text
+    assert "offset drift a factor of more than a million yes" in text
+
+
+def test_the_summary_has_no_word_of_the_statistics_behind_it():
+    for made in (make_diagnosis(0, samples=100), make_diagnosis(1, samples=100), make_diagnosis(3, samples=100)):
+        page = diagnosis_report(made)
+        top_of_page = text_of(page[page.index('<div class="top') : page.index("<h2", page.index('class="top facts"'))])
+        assert not re.search("nats|surrogate", top_of_page)
 
 
 def test_inseparable_rivals_are_in_the_headline():
     text = text_of(page_of(1))
     assert "hard-iron step or current field (current), which this recording cannot distinguish." in text
-    assert "current field (current) 1.30 no" in text
+    assert "current field (current) a factor of 3.7 no" in text
     assert "not distinguished from finding 1" in text
     headline = "Left out of the simulation: hard-iron step, or an alternative; current field (current)."
     assert headline in text_of(page_of(3))
@@ -255,45 +262,45 @@ def test_a_smooth_correction_worse_than_the_findings_is_not_reported():
 
 
 def headline_and_advice(gain, interval, before, after, verdict="explained"):
-    """Return headline, status and advice of a step with this held-out evidence, and the diagnosis."""
+    """Return headline, answer and advice of a step with this held-out evidence, and the diagnosis."""
     held_out = HeldOut(gain, interval, before, after, "µT")
     diagnosis = first_changed(
         make_diagnosis(1, samples=240), prediction.held_out_gain_result(held_out, ""), alternatives=()
     )
     diagnosis = dataclasses.replace(diagnosis, verdict=verdict)
     diagnosis = dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
-    return top.headline(diagnosis), top.status(diagnosis), " ".join(top.to_do(diagnosis)), diagnosis
+    return top.headline(diagnosis), top.answer_word(diagnosis), " ".join(top.to_do(diagnosis)), diagnosis
 
 
 def test_an_unconfirmed_finding_is_excluded_from_headline_advice_and_command():
-    headline, status, doing, diagnosis = headline_and_advice(0.134, (-0.019, 0.276), 1.74, 1.73, verdict="unexplained")
+    headline, answer, doing, diagnosis = headline_and_advice(0.134, (-0.019, 0.276), 1.74, 1.73, verdict="unexplained")
     assert headline.endswith("too small to be worth correcting: hard-iron step.")
     assert "Found, but not confirmed on held-out blocks and" in headline
-    assert status == "open"
+    assert answer == "look"
     assert "Do not correct for hard-iron step yet" in doing
     assert "use the calibration" not in doing
     assert top.apply_command(diagnosis) == ""
     text = text_of(diagnosis_report(diagnosis))
     assert "probably better on held-out blocks, not surely" in text
     assert "mkc apply" not in text
-    assert '<h1 class="bad">' in diagnosis_report(diagnosis)
+    assert '<h1 class="look">' in diagnosis_report(diagnosis)
     larger, *_ = headline_and_advice(-0.16, (-0.41, 0.09), 0.269, 0.231, verdict="unexplained")
     assert larger.endswith("Found, but not confirmed on held-out blocks: hard-iron step.")
 
 
 def test_a_finding_that_hardly_reduces_the_residual_is_reported_as_small():
-    headline, status, doing, diagnosis = headline_and_advice(0.05, (0.03, 0.07), 1.74, 1.70)
+    headline, answer, doing, diagnosis = headline_and_advice(0.05, (0.03, 0.07), 1.74, 1.70)
     assert headline.startswith("Real, but small compared with the noise: hard-iron step")
-    assert status == "faint"
+    assert answer == "usable"
     assert "Do not correct for hard-iron step, unless" in doing
     assert "by only 2.3 %" in doing
     assert top.apply_command(diagnosis) == ""
 
 
 def test_a_confirmed_finding_is_reported_as_left_out_of_the_simulation():
-    headline, status, doing, diagnosis = headline_and_advice(0.31, (0.28, 0.35), 0.9, 0.5)
+    headline, answer, doing, diagnosis = headline_and_advice(0.31, (0.28, 0.35), 0.9, 0.5)
     assert headline.startswith("Left out of the simulation: hard-iron step")
-    assert status == "found"
+    assert answer == "usable"
     assert doing.startswith("Look for what changed at that time; use the calibration from after the step.")
     assert "The model found here corrects for hard-iron step" in doing
     assert "surely better on held-out blocks" in text_of(diagnosis_report(diagnosis))
@@ -301,13 +308,13 @@ def test_a_confirmed_finding_is_reported_as_left_out_of_the_simulation():
 
 def test_structure_without_a_finding_is_in_the_headline():
     quiet = make_diagnosis(0, samples=240)
-    assert top.status(quiet) == "good"
+    assert top.answer_word(quiet) == "usable"
     rare = make_diagnosis(0, samples=240, p_value=0.04)
     assert top.headline(rare) == "The residual has structure that no effect in the catalogue explains."
     smooth = make_diagnosis(0, samples=240, remaining=("temperature",))
     assert top.headline(smooth).startswith("The residual has a smooth trend along temperature that no effect")
     for diagnosis in (rare, smooth):
-        assert top.status(diagnosis) == "open"
+        assert top.answer_word(diagnosis) == "look"
         text = text_of(diagnosis_report(diagnosis))
         assert "no missing physics" not in text
         assert "The simulation can be used" not in text
@@ -455,18 +462,20 @@ def test_a_long_driver_name_is_not_truncated():
 def test_extrapolation_of_a_finding_is_reported():
     diagnosis = make_diagnosis(2, samples=300)
     assert "beyond its range" not in text_of(diagnosis_report(diagnosis))
-    for gain, interval, label in (
+    for gain, interval, label, number in (
         (
             0.31,
             (0.28, 0.35),
-            "it improves the prediction at high values: +0.310 nats per sample (95 %: 0.280 to 0.350)",
+            "improves the prediction at high values",
+            "+0.310 nats per sample (95 %: 0.280 to 0.350)",
         ),
-        (-0.02, (-0.12, 0.09), "it is not significant at high values: −0.020"),
-        (-0.3, (-0.4, -0.2), "it degrades the prediction at high values: −0.300"),
+        (-0.02, (-0.12, 0.09), "is not significant at high values", "−0.020 nats per sample"),
+        (-0.3, (-0.4, -0.2), "degrades the prediction at high values", "−0.300 nats per sample"),
     ):
         result = prediction.extrapolation_result(Extrapolation(gain, interval))
         text = text_of(diagnosis_report(first_changed(diagnosis, result)))
-        assert f"beyond its range fitted at low values of its driver, {label}" in text
+        assert f"beyond its range fitted at low values of its driver, it {label}" in text
+        assert f"hard-iron step +0.312 nats per sample (95 %: 0.281 to 0.350) {number}" in text
 
 
 def test_the_gain_of_shifted_copies_of_the_driver_is_reported():

@@ -48,8 +48,10 @@ def with_first(diagnosis, change):
 
 
 def box_of(page):
-    """Return the text of the box at the top."""
-    text = text_of(page[page.index('<div class="top') : page.index("</table>")] + "</table></div>")
+    """Return the text of the box at the top and of the facts below the first picture."""
+    head, facts = page.index('<div class="top'), page.index('<div class="top facts">')
+    rows = page[facts : page.index("</table>", facts)]
+    text = text_of(page[head : page.index("</div>", head)] + "</div>" + rows + "</table></div>")
     return re.sub(" ([.,:])", r"\1", text)  # after code
 
 
@@ -65,7 +67,7 @@ def test_the_box_has_the_goodness_of_fit_of_each_output_in_its_unit():
     assert "rate: residual 0.0310 rad/s; noise floor 0.0200 rad/s (estimated); explains 99.95 %" in box
     assert "The residual is the sensor's noise. Input hold: torque is constant between samples." in box
     assert "µT" not in box.replace("reaches 0", "").split("For comparison")[0]
-    assert '<h1 class="good">' in page
+    assert '<h1 class="usable">' in page
 
 
 def test_an_output_of_small_variation_has_no_explained_share():
@@ -97,29 +99,29 @@ def test_the_page_of_a_poor_fit_starts_with_it_and_names_no_physics():
         "noise floor 0.00500 rad (declared)"
     ) in box
     assert "Why Another start reaches 0.006 rad: gravity = −9.81 with the other sign. damping ends at its bound" in box
-    assert '<h1 class="bad">' in page
+    assert '<h1 class="unusable">' in page
     text = text_of(page)
     for words in ("The simulation can be used", "no missing physics", "The candidates", "hard-iron", "distinguish"):
         assert words not in text
 
 
-def test_the_status_is_good_if_adequate_and_open_if_unfit_or_unexplained():
+def test_the_answer_is_usable_if_adequate_or_explained_look_if_unexplained_and_unusable_if_unfit():
     quiet = make_diagnosis(0, samples=50, environment=make_environment(process_noise=(), disturbance=()))
-    assert [top.status(d) for d in (quiet, make_unfit(), disturbed(), make_diagnosis(1, samples=50))] == [
-        "good", "open", "open", "found",
+    assert [top.answer_word(d) for d in (quiet, make_unfit(), disturbed(), make_diagnosis(1, samples=50))] == [
+        "usable", "unusable", "look", "usable",
     ]  # fmt: skip
 
 
-def test_the_disturbance_is_the_first_picture_with_size_and_correlation_time():
+def test_the_disturbance_has_a_picture_after_the_residual_with_size_and_correlation_time():
     page = diagnosis_report(disturbed())
     parse_page(page)
-    assert page.index("Disturbance over time, and") < page.index("Residual over time before and after")
+    assert page.index("Residual over time before and after") < page.index("Disturbance over time, and")
     box = box_of(page)
     assert box.startswith("Process noise acts on the rate of rate, and no physics in the catalogue explains it.")
     assert "Process noise on the rate of rate: 0.228 ± 0.021 rad/s², correlation time 0.7 s." in box
     assert (
-        "A model without this noise of rate is 311 nats less likely. No physics is significant in addition to it."
-        in box
+        "A model without this noise of rate is less likely by a factor of more than a million. "
+        "No physics is significant in addition to it." in box
     )
     text = text_of(page)
     assert "It is not white: it is correlated up to 0.7 s. It goes along with none of the inputs, at no lag." in text
@@ -172,7 +174,7 @@ def test_a_form_that_is_kept_at_a_small_p_value_has_a_reason():
     kept = ShapeCheck(5.2, 0.0055)
     made = with_first(make_diagnosis(1, samples=200), lambda finding: dataclasses.replace(finding, shape=kept))
     text = text_of(diagnosis_report(made))
-    assert "gains only 5.20 nats (p = 0.0055 if the name is right): the name is kept" in text
+    assert "is only a little better (p = 0.0055 if the name is right): the name is kept" in text
 
 
 def test_an_effect_of_another_shape_is_nearest_and_its_free_curve_is_shown():
@@ -181,13 +183,14 @@ def test_an_effect_of_another_shape_is_nearest_and_its_free_curve_is_shown():
     headline = top.headline(made)
     assert headline.startswith("The residual has structure that no effect in the catalogue explains")
     assert "Nearest in the catalogue: hard-iron step (a free curve" in headline
-    assert "163 nats" in headline
+    assert "nats" not in headline
     text = text_of(page)
     assert "Left out" not in text
     assert "Nearest in the catalogue: hard-iron step" in text
     assert "Free curve with its 95 % band, and the named shape" in text
     assert "Nearest formula: 0.0071 |x|^1.52 sign(x) ." in text
-    assert "gains 163 nats (p = 0.002 if the name is right)" in text
+    assert "is clearly better (p = 0.002 if the name is right)" in text
+    assert "163 nats" in text[text.index("How this was decided") :]
     assert page.index("Free curve and the shape of finding 1") < page.index("Curve of finding 1, and")
     parse_page(page)
     # of another driver than the named form: the free curve alone
@@ -313,7 +316,8 @@ def test_nats_are_explained_once_before_their_first_use():
     for made in (make_diagnosis(3, samples=100, channels=2), disturbed()):
         page = diagnosis_report(made)
         assert page.count(text) == 1
-        assert page.index(text) < page.index("<h2>")
+        first = page.index(" nats", page.index("<h1"))
+        assert first in range(page.index(text), page.index(text) + 60)
     assert text not in diagnosis_report(make_unfit())
 
 
@@ -338,5 +342,5 @@ def test_a_poor_fit_is_reported_as_a_poor_fit():
     lost = make_diagnosis(
         0, samples=50, environment=make_environment(goodness_of_fit=POOR_FITS, process_noise=(), disturbance=())
     )
-    assert top.status(lost) == "open"
+    assert top.answer_word(lost) == "unusable"
     assert "does not fit the recording" in top.headline(lost)

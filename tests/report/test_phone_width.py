@@ -26,6 +26,7 @@ from tests.diagnosis.factory import (
     make_goodness_of_fit,
     make_unfit,
     with_another_shape,
+    with_courses,
 )
 from tests.diagnosis.validation.tank import tank_recording, usual_model
 
@@ -112,6 +113,7 @@ PAGES = {
     "process noise": lambda: make_diagnosis(0, samples=200, verdict="unexplained", environment=make_environment()),
     "nearest": first_nearest,
     "long names": long_names,
+    "recording and simulation": lambda: with_courses(long_names()),
 }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, score
 from mkc_torch.diagnosis.goodness_of_fit import units_of
 from mkc_torch.diagnosis.model.fit import FittedModel, within_domain, without_term
 from mkc_torch.diagnosis.model.term import Driver, Term
+from mkc_torch.diagnosis.parts import OutputSize
 from mkc_torch.diagnosis.result import EvidenceResult, HeldOutScore, SmoothCorrection
 from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.diagnosis.search.run import SearchResult
@@ -125,10 +126,11 @@ class EvidenceContext:
         """Return the RMSE of a model on held-out blocks, over the inliers."""
         return float(model.residual[self.inliers].square().mean().sqrt())
 
-    def spread(self, model: Evidence) -> HeldOutScore:
-        """Return the score of a model on held-out blocks."""
+    def spread(self, model: Evidence, outputs: Mapping[str, OutputSize] | None = None) -> HeldOutScore:
+        """Return the score of a model on held-out blocks; ``outputs`` has the sizes of its residuals if known."""
         mean = float(model.log_likelihood.mean())
-        return HeldOutScore(mean, self.rms(model), tuple(model.sigma.tolist()), tuple(model.d.tolist()))
+        density = tuple(model.sigma.tolist()), tuple(model.d.tolist())
+        return HeldOutScore(mean, self.rms(model), *density, {} if outputs is None else outputs)
 
 
 @dataclass(frozen=True)

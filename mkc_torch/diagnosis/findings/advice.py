@@ -16,7 +16,7 @@ from mkc_torch.diagnosis.held_out_gain import change
 from mkc_torch.diagnosis.result import Alternative, Diagnosis, Finding
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.verdict import conclusion, doubted_signs
-from mkc_torch.diagnosis.vetoes import transfers, worth_correcting
+from mkc_torch.diagnosis.vetoes import refusal, transfers, worth_correcting
 from mkc_torch.effects import is_curve
 from mkc_torch.effects.kinds import MOTION
 
@@ -78,7 +78,12 @@ def _after_the_search(diagnosis: Diagnosis) -> tuple[str, ...]:
     advice = [sentence for finding in d.findings for sentence in _of(finding, d)]
     advice += _of_what_remains(d)
     use = [_called(f, d) for f in d.findings if transfers(f)]
-    if use:
+    if use and "not_better" in conclusion(d).doubts:
+        advice.append(
+            f"Do not apply the model found here for {' and '.join(use)} yet: the residual on held-out blocks is not "
+            "smaller with it. Record again, for longer."
+        )
+    elif use:
         advice.append(f"The model found here corrects for {' and '.join(use)}: confirm it on a second recording.")
     return tuple(dict.fromkeys(advice))
 
@@ -163,8 +168,8 @@ def _hold_back(finding: Finding, d: Diagnosis) -> str:
         )
     wider = f", with {', '.join(f.drivers)} over a wider range," if f.drivers else ","
     return (
-        f"Do not correct for {_called(f, d)} yet: held-out blocks do not confirm it. Record again, for longer{wider} "
-        "and check whether it is found again."
+        f"Do not correct for {_called(f, d)} yet: {refusal(f)}. Record again, for longer{wider} and check whether it "
+        "is found again."
     )
 
 

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from mkc_torch._support.dual_constants import dual_constants
 from mkc_torch._support.unit_text import ratio, sized, tidy
-from mkc_torch.diagnosis.environment import Curve
 from mkc_torch.diagnosis.evidence.base import gain_of
 from mkc_torch.diagnosis.findings.advice import SAME, distinguishing_state
 from mkc_torch.diagnosis.findings.at_input import size_at_input
+from mkc_torch.diagnosis.findings.curve import curve_of_effect, places_of
 from mkc_torch.diagnosis.findings.regions import attributed, map_of, region_of, shares_of_runs
-from mkc_torch.diagnosis.findings.shape import FINE_POINTS, drawn_points, formulas
+from mkc_torch.diagnosis.findings.shape import formulas
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.shapes import reach_of
 from mkc_torch.diagnosis.model.term import Term
@@ -114,9 +112,6 @@ _MOST_GAIN = 0.9
 _CONCENTRATED = 0.35
 """Largest share of best blocks for which the gain counts as concentrated."""
 
-_NORMAL_95 = 1.959964
-"""Half-width of a 95 % interval in standard errors."""
-
 
 def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quick: bool = False) -> Finding:
     """Return the finding of effect ``number`` of the final model, without its evidence.
@@ -134,7 +129,7 @@ def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quic
     plausible, text = _plausibility(term, gamma, context)
     cannot_be = far_from_plausible(term, gamma, context)
     where = None if quick else attributed(final.fit, number)
-    curve = _curve(term, gamma, covariance, context)
+    curve = curve_of_effect(term, gamma, covariance, context)
     of_motion_or_driver = term.effect.is_curve and not term.effect.unrecorded
     approximations = formulas(curve) if of_motion_or_driver and curve is not None else ()
     event_times = term.effect.moments(context)
@@ -174,14 +169,6 @@ def _references(term: Term) -> tuple[Reference, ...]:
         return ()
     values = term.driver.reference.tolist()
     return tuple(Reference(*entry) for entry in zip(term.columns, values, term.driver.units, strict=True))
-
-
-def places_of(term: Term, channels: Sequence[str]) -> tuple[str, ...]:
-    """Return the places on which a term acts: channels of a residual, or rates, inputs and parameters."""
-    if "rate of " in term.at or term.at.startswith("exchange of "):
-        return tuple(f"rate of {name}" for name in channels)
-    kind = "input" if term.at.startswith("entry of ") else term.at.partition(" ")[0]
-    return tuple(f"{kind} {name}" if kind in ("input", "parameter") else name for name in channels)
 
 
 def _own(final: FinalEstimate, number: int) -> tuple[Tensor, Tensor]:
@@ -330,72 +317,6 @@ def intervals_of(gain: Float[Tensor, " N"], time: Float[Tensor, " N"]) -> tuple[
         else:
             intervals.append((first, last))
     return tuple(intervals)
-
-
-def _curve(term: Term, gamma: Tensor, covariance: Tensor, context: Context) -> Curve | None:
-    """Return the effect's change at its port over its driver, signal or time, with its 95 % band."""
-    made = _along(term, context)
-    if made is None:
-        return None
-    driver, unit, x, synthetic = made
-    shape = {name: value for name, value in term.shape.items() if name != "lag"}
-
-    def change(gamma: Tensor) -> Tensor:
-        return term.effect.change(gamma, shape, synthetic)
-
-    slope = torch.func.jacfwd(dual_constants(change))(gamma)
-    variance = torch.einsum("ncq,qr,ncr->nc", slope, covariance, slope).clamp(min=0.0)
-    channels, value_unit = places_of(term, context.channels), tidy(context.signal_unit)
-    value = change(gamma).detach()
-    # formulas are fitted to evenly spaced points of a free curve
-    kept = drawn_points(value, evenly=term.effect.is_curve or driver == "time")
-    return Curve(driver, unit, x[kept], value[kept], _NORMAL_95 * variance.sqrt()[kept], channels, value_unit)
-
-
-def _along(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | None:
-    if context.parts and term.driver is None:
-        return _along_part(term, context)
-    flat = context.signal.median(0).values.expand(FINE_POINTS, -1)
-    if term.driver is not None:
-        values = context.drivers
-        if values.shape[1] == 1:
-            x = torch.linspace(float(values.min()), float(values.max()), FINE_POINTS, dtype=values.dtype)
-            drivers, name, unit = x.unsqueeze(-1), term.columns[0], term.driver.units[0]
-            shown = x + term.driver.reference
-        else:
-            direction = torch.linalg.svd(values - values.mean(0), full_matrices=False).Vh[0]
-            along = values @ direction
-            x = torch.linspace(float(along.min()), float(along.max()), FINE_POINTS, dtype=values.dtype)
-            drivers, unit, shown = x.unsqueeze(-1) * direction, term.driver.units[0], x
-            name = f"{term.columns[0].rpartition('_')[0]}, main direction"
-        time = torch.arange(FINE_POINTS, dtype=values.dtype)
-        return name, unit, shown, replace(context, time=time, drivers=drivers, signal=flat)
-    if term.effect.follows_signal:
-        reach = float(context.signal.abs().max())
-        x = torch.linspace(-reach, reach, FINE_POINTS, dtype=context.signal.dtype)
-        signal = x.unsqueeze(-1).expand(-1, context.signal.shape[1])
-        time = torch.arange(FINE_POINTS, dtype=x.dtype)
-        none = context.drivers.new_zeros(FINE_POINTS, 0)
-        return "field on the axis", context.signal_unit, x, replace(context, time=time, signal=signal, drivers=none)
-    index = torch.linspace(0, len(context.time) - 1, FINE_POINTS).long()
-    time, signal = context.time[index], context.signal[index]
-    none = context.drivers.new_zeros(len(index), 0)
-    return "time", "s", time, replace(context, time=time, drivers=none, signal=signal)
-
-
-def _along_part(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | None:
-    """Return the range of the effect's main component, with the other components at their medians."""
-    part = term.effect.plot_axis
-    if part not in context.parts:
-        return None
-    name = context.parts[part]
-    values = context.component(name)
-    x = torch.linspace(float(values.min()), float(values.max()), FINE_POINTS, dtype=values.dtype)
-    signal = context.signal.median(0).values.expand(FINE_POINTS, -1).clone()
-    signal[:, (context.carries or context.channels).index(name)] = x
-    time = torch.arange(FINE_POINTS, dtype=x.dtype)
-    synthetic = replace(context, time=time, signal=signal, drivers=context.drivers.new_zeros(FINE_POINTS, 0))
-    return name, context.unit_of(part), x, synthetic
 
 
 def labels(terms: Sequence[Term]) -> tuple[str, ...]:

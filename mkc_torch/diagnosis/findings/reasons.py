@@ -130,8 +130,8 @@ def _of_trials(prepared: PreparedDynamics, fits: Sequence[FittedModel], follows:
     for name, size in still:
         if size is not None and bool((size <= now / _MATTERS).all()):
             sentences.append(
-                f"`{name}` explains nothing in this fit: held at its mean, the residual of {', '.join(known)} is no "
-                "larger."
+                f"`{name}` explains nothing in this fit: held at its mean, the residual of {', '.join(known)} is at "
+                f"most {100.0 * (1.0 / _MATTERS - 1.0):.0f} % larger."
             )
     return sentences[:3]
 

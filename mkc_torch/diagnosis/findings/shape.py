@@ -83,7 +83,7 @@ def formulas(curve: Curve) -> tuple[str, ...]:
     """Return, for each channel, a constant plus the fewest terms that stay in the curve's band.
 
     Args:
-        curve: with its 95 % band.
+        curve: with its 95 % band; points without a value are left out.
 
     Returns:
         Formulas such as ``δ(rate of speed) = 0.44 − 0.46 speed + 0.027 speed |speed| rad/s²``, each with its relative
@@ -96,11 +96,14 @@ def formulas(curve: Curve) -> tuple[str, ...]:
         >>> formulas(Curve("speed", "m/s", x, value, band, ("rate of speed",), "m/s²"))
         ('δ(rate of speed) = −0.5 speed |speed| m/s² (RMS error 0 %)',)
     """
-    x = curve.x
+    seen = curve.value.isfinite().all(-1)
+    if not bool(seen.any()):
+        return ()
+    x, value, band = curve.x[seen], curve.value[seen], curve.band[seen]
     columns = {name: make(x) for name, make in _library(float(x.min()), float(x.max())).items()}
     name = curve.driver
     return tuple(
-        _formula(channel, name, curve.value_unit, columns, curve.value[:, k], curve.band[:, k])
+        _formula(channel, name, curve.value_unit, columns, value[:, k], band[:, k])
         for k, channel in enumerate(curve.channels)
     )
 

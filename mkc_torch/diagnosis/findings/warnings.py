@@ -55,7 +55,8 @@ def rejected_warnings(intervals: Sequence[RejectedInterval]) -> tuple[str, ...]:
         return ()
     times = [f"from {interval.start:.1f} to {interval.end:.1f} s" for interval in sorted(found[:_MOST_LISTED])]
     if len(found) > _MOST_LISTED:
-        times.append(f"in {len(found) - _MOST_LISTED} shorter intervals")
+        more = len(found) - _MOST_LISTED
+        times.append(f"in {more} shorter interval{'' if more == 1 else 's'}")
     where = " and ".join([", ".join(times[:-1]), times[-1]] if times[1:] else times)
     return (
         f"Most samples were rejected {where}. No effect explains them. They may be a disturbance of the measurement, "

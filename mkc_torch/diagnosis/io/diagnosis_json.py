@@ -303,12 +303,9 @@ def _noise(noise: NoiseSummary) -> dict[str, Any]:
 
 
 def _score(score: HeldOutScore) -> dict[str, Any]:
-    return {
-        "log_likelihood": score.log_likelihood,
-        "rmse": score.rmse,
-        "sigma": [_sigma(s) for s in score.sigma],
-        "d": score.d,
-    }
+    sigma, sizes = [_sigma(s) for s in score.sigma], {name: asdict(size) for name, size in score.outputs.items()}
+    content = {"log_likelihood": score.log_likelihood, "rmse": score.rmse, "sigma": sigma, "d": score.d}
+    return {**content, **({"outputs": sizes} if sizes else {})}
 
 
 def _finding(finding: Finding) -> dict[str, Any]:

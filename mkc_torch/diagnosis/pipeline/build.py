@@ -31,10 +31,11 @@ from mkc_torch.diagnosis.model.shapes import described
 from mkc_torch.diagnosis.model.term import Drivers, Term
 from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
 from mkc_torch.diagnosis.optional import optional
-from mkc_torch.diagnosis.pipeline.counted import counted_fit, counts, left_out_note
+from mkc_torch.diagnosis.pipeline.counted import corrected_model, left_out_note, scores_of
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.search_notes import significance
-from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Finding, Separability, Stop, Traces, notices
+from mkc_torch.diagnosis.pipeline.traces import traces_of
+from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Finding, Separability, Stop, notices
 from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import NamingSettings, NoiseSettings
@@ -48,7 +49,7 @@ from mkc_torch.diagnosis.verdict import (
     reservations_of,
     verdict_of,
 )
-from mkc_torch.diagnosis.vetoes import VetoContext, decisions_on, grade, is_dropped
+from mkc_torch.diagnosis.vetoes import VetoContext, counts, decisions_on, grade, is_dropped
 from mkc_torch.recording.unit_warnings import unit_warnings
 from mkc_torch.simulation.dynamics.impossible import impossible_checks, impossible_values
 from mkc_torch.simulation.dynamics.noise import sized_noise
@@ -167,6 +168,8 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
     findings = tuple(finding for finding, decided in graded if not is_dropped(decided))
     without_size = tuple(finding for finding, decided in graded if is_dropped(decided))
     kept = [number for number, (finding, decided) in enumerate(graded) if counts(finding) and not is_dropped(decided)]
+    corrected = corrected_model(whole.base.fit, case, kept, limit_s=None if whole.stop is None else _MOMENT_S)
+    scores = scores_of(case, corrected)
     diagnosis = Diagnosis(
         recording=prepared.recording.name,
         simulation=prepared.name,
@@ -179,8 +182,8 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
         p_value=_p_value(first, whole),
         verdict="adequate",
         findings=findings,
-        baseline=case.spread(case.held_out[0]),
-        corrected=case.spread(case.held_out[-1]),
+        baseline=scores[0],
+        corrected=scores[1],
         advice=(),
         warnings=(
             *notices(whole.stop, quick=options.quick, too_few=options.too_few),
@@ -196,8 +199,8 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
         notes=(*prepared.recording.notes, *notes_of(whole.drivers.warnings), *left_out_note(findings)),
         candidates=_candidates(first),
         separability=separability(first) if first else _nothing_to_separate(),
-        traces=_traces(prepared, whole.drivers, case.base, final),
-        model=_model(whole, counted_fit(final.fit, whole.base.fit, kept)),
+        traces=traces_of(case, whole.drivers, corrected),
+        model=_model(whole, corrected.exported),
         checks=(*prepared.checks, *_impossible(whole)),
         evidence=answers.of_all,
         environment=_environment(whole, known, unfit=unfit),
@@ -404,24 +407,4 @@ def _time_warnings(prepared: PreparedSimulation) -> tuple[str, ...]:
         return ()
     return (
         "The recording has no column `time`: sample numbers replace seconds, and samples are taken as evenly spaced.",
-    )
-
-
-def _traces(prepared: PreparedSimulation, drivers: Drivers, base: FittedModel, final: FinalEstimate) -> Traces:
-    shown = {
-        name: driver.values[:, k] + driver.reference[k]
-        for driver in drivers.drivers
-        for k, name in enumerate(driver.columns)
-    }
-    units = {name: unit for driver in drivers.drivers for name, unit in zip(driver.columns, driver.units, strict=True)}
-    return Traces(
-        time=prepared.time,
-        has_time=prepared.recording.time is not None,
-        before=base.residual,
-        after=final.fit.residual,
-        weight=final.fit.weights,
-        channels=prepared.channels,
-        unit=prepared.unit,
-        drivers=shown,
-        driver_units=units,
     )

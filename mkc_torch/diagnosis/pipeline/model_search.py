@@ -192,7 +192,7 @@ def _wrong_column(beam: BeamSearch, base: ProcessNoiseFit, options: SearchOption
     sizes = dict(zip(found.fit.model.prepared.channels, size_of(found.fit.residual).tolist(), strict=True))
     reached = ", ".join(f"{name} {size:.3g}" for name, size in sizes.items())
     return (
-        f"With the {found.change.sentence} the simulation scores {gain:.0f} nats more than with any effect; the "
+        f"With the {found.change.sentence} the simulation scores {gain:.0f} more than with any effect; the "
         f"open-loop residual is then {reached}."
     )
 

@@ -27,6 +27,7 @@ from mkc_torch.diagnosis.plot.drawings import (
     unit_of_channel,
     units_of_outputs,
 )
+from mkc_torch.diagnosis.vetoes import counts
 from mkc_torch.effects import words_of
 
 _MOST_SHOWN = 12
@@ -73,22 +74,23 @@ class DiagnosisPlot:
 
         Args:
             channel: number or name of an output.
-            corrected: with the findings; default if there are any.
+            corrected: with the findings that count; default if there are any.
             ax: axes of matplotlib.
 
         Raises:
-            ValueError: the channel does not exist, or ``corrected`` is True without findings.
+            ValueError: the channel does not exist, or ``corrected`` is True and no finding counts.
         """
         t, which = self._traces, self._channel(channel)
-        after = bool(self._findings) if corrected is None else corrected
-        if after and not self._findings:
-            raise ValueError("Expected argument `corrected` to be False: the diagnosis has no findings.")
+        some = any(counts(finding) for finding in self._findings)
+        after = some if corrected is None else corrected
+        if after and not some:
+            raise ValueError("Expected argument `corrected` to be False: the diagnosis has no finding that counts.")
         ax = axes_or_new(ax)
         mark_findings(ax, self._findings)
         draw_residual(ax, t, array(t.time), which, unit_of_channel(t, self._environment, which), after=after)
         floor = [fit.noise_floor for fit in self._environment.goodness_of_fit if fit.output == t.channels[which]]
         draw_floor(ax, floor[0] if floor else None)
-        ax.set_title(of_channel(MOMENTS[after] if self._findings else "residual", t.channels[which]))
+        ax.set_title(of_channel(MOMENTS[after] if some else "residual", t.channels[which]))
         ax.set_xlabel(of_time(t.has_time))
         return ax
 
@@ -107,7 +109,7 @@ class DiagnosisPlot:
             finding: its number, from 0.
             driver: a recorded column; default the finding's first.
             channel: number or name of an output; default the channel with the largest change.
-            corrected: with the findings.
+            corrected: with the findings that count, and with this one.
             ax: axes of matplotlib.
 
         Raises:
@@ -126,7 +128,7 @@ class DiagnosisPlot:
         which = acting_channels(t, found)[0] if channel is None else self._channel(channel)
         ax = axes_or_new(ax)
         unit = unit_of_channel(t, self._environment, which)
-        draw_residual(ax, t, array(t.drivers[name]), which, unit, after=corrected)
+        draw_residual(ax, t, array(t.drivers[name]), which, unit, after=corrected, finding=found)
         ax.set_title(of_channel(MOMENTS[corrected], t.channels[which]))
         ax.set_xlabel(named(name, t.driver_units.get(name, "")))
         return ax

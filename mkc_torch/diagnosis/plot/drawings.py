@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from mkc_torch._support.drawing import BLUE, GREY, INK, ORANGE, SHADE, array
 from mkc_torch._support.typesetting import capital, plain
 from mkc_torch._support.unit_text import tidy
 from mkc_torch.diagnosis.environment import Curve, DisturbanceEstimate, NoiseEnvironment
 from mkc_torch.diagnosis.parts import Finding, StateMap, Traces
+from mkc_torch.diagnosis.vetoes import counts
 
 MOMENTS = ("before", "after")
 
@@ -49,18 +51,30 @@ class _Bins:
     rms: np.ndarray
 
 
-def draw_residuals(axes: Sequence[Any], t: Traces, x: np.ndarray, channel: int, unit: str) -> None:
+def draw_residuals(
+    axes: Sequence[Any], t: Traces, x: np.ndarray, channel: int, unit: str, finding: Finding | None = None
+) -> None:
     """Draw the residual before and, on the second axes, after."""
     for ax, after in zip(axes, (False, True), strict=False):
-        draw_residual(ax, t, x, channel, unit, after=after)
+        draw_residual(ax, t, x, channel, unit, after=after, finding=finding)
 
 
-def draw_residual(ax: Any, t: Traces, x: np.ndarray, channel: int, unit: str, *, after: bool) -> None:
-    """Draw samples, and mean and RMS of the samples in use; with ``after``, also the RMS before."""
+def residual_after(t: Traces, finding: Finding | None = None) -> Tensor:
+    """Return the residual with the findings that count, (N, m); of a finding that does not count, with all."""
+    return t.after if finding is None or counts(finding) or t.with_all is None else t.with_all
+
+
+def draw_residual(
+    ax: Any, t: Traces, x: np.ndarray, channel: int, unit: str, *, after: bool, finding: Finding | None = None
+) -> None:
+    """Draw samples, and mean and RMS of the samples in use; with ``after``, also the RMS before.
+
+    ``finding`` is one whose effect the residual after includes; None for that of all findings that count.
+    """
     before, used = array(t.before[:, channel]), array(t.weight[:, channel]) >= 0.5
     limit, earlier, shown = _limit(before[used]), _binned(x[used], before[used]), _apart(x)
     marker = "o" if len(earlier.x) <= _MOST_LEVELS else ""
-    e = array(t.after[:, channel]) if after else before
+    e = array(residual_after(t, finding)[:, channel]) if after else before
     near = np.isfinite(x) & (np.abs(e) <= limit)
     ax.axhline(0.0, color=GREY, lw=0.7, zorder=1)
     for mask, color in ((near & ~used, _REJECTED), (near & used, _USED)):
@@ -159,7 +173,7 @@ def of_channel(key: str, channel: str) -> str:
 def acting_channels(t: Traces, finding: Finding) -> list[int]:
     """Return the channels of a finding, the largest change first."""
     acting = [i for i, name in enumerate(t.channels) if name in finding.channels] or list(range(len(t.channels)))
-    change = (t.before - t.after).nan_to_num().square().sum(0).tolist()
+    change = (t.before - residual_after(t, finding)).nan_to_num().square().sum(0).tolist()
     return sorted(acting, key=lambda i: -change[i])
 
 

@@ -9,7 +9,13 @@ from types import MappingProxyType
 
 from mkc_torch._support.typesetting import typeset
 from mkc_torch.diagnosis.decisions import ScoredModel, Trail
+from mkc_torch.diagnosis.result import Diagnosis, Extrapolation
+from mkc_torch.report.diagnosis.findings import finding_name
+from mkc_torch.report.diagnosis.numbers import gain
 from mkc_torch.report.words.numbers import number, size
+
+_FAR = 1000
+"""Gain in nats per sample beyond which only this limit is stated."""
 
 _LOG_LIKELIHOOD = "log_likelihood"
 """Part of a score that is no price."""
@@ -68,9 +74,34 @@ class DecisionRow:
     sentence: str
 
 
-def is_empty(trail: Trail) -> bool:
+@dataclass(frozen=True)
+class GainRow:
+    """Cells of a finding: its gain on held-out blocks and at high values, and that of a free curve in its place."""
+
+    name: str
+    held_out: str
+    high_values: str
+    free_curve: str
+
+
+def is_empty(diagnosis: Diagnosis) -> bool:
     """Whether there is nothing to show."""
-    return not trail.models and not trail.decisions
+    trail = diagnosis.decisions
+    return not trail.models and not trail.decisions and not gain_rows(diagnosis)
+
+
+def gain_rows(diagnosis: Diagnosis) -> list[GainRow]:
+    """Return the gains of each finding; empty if none is known."""
+    rows = [
+        GainRow(
+            finding_name(finding),
+            "not measured" if finding.held_out is None else gain(finding.held_out),
+            "not tested" if finding.extrapolation is None else typeset(_at_high_values(finding.extrapolation)),
+            "not tested" if finding.shape is None else f"{size(finding.shape.free_curve_gain)} nats",
+        )
+        for finding in diagnosis.findings
+    ]
+    return rows if any(f.held_out is not None or f.shape is not None for f in diagnosis.findings) else []
 
 
 def model_rows(trail: Trail) -> list[ModelRow]:
@@ -124,6 +155,23 @@ def decision_rows(trail: Trail) -> list[DecisionRow]:
         )
         for decision in trail.decisions
     ]
+
+
+def _at_high_values(extrapolation: Extrapolation) -> str:
+    """Format the gain with its interval, to two digits of its standard error.
+
+    Example:
+        >>> _at_high_values(Extrapolation(-0.0212, (-0.12, 0.09)))
+        '-0.021 nats per sample (95 %: -0.120 to 0.090)'
+        >>> _at_high_values(Extrapolation(3e6, (4.0, 9e6)))
+        'more than +1000 nats per sample'
+    """
+    if abs(extrapolation.log_likelihood_gain) > _FAR:
+        return f"{'more than +' if extrapolation.log_likelihood_gain > 0.0 else 'less than -'}{_FAR} nats per sample"
+    low, high = extrapolation.confidence_interval
+    places = max(1 - math.floor(math.log10(0.25 * (high - low))), 0) if high > low else 3
+    gain, low, high = (round(value, places) + 0.0 for value in (extrapolation.log_likelihood_gain, low, high))
+    return f"{gain:+.{places}f} nats per sample (95 %: {low:.{places}f} to {high:.{places}f})"
 
 
 def _known(value: float | None) -> bool:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from mkc_torch._support.typesetting import typeset
-from mkc_torch.diagnosis.result import DensityCheck, DriverShift, EvidenceResult, Extrapolation
-
-_FAR = 1000
-"""Nats per sample beyond which no exact gain is shown: one of the models leaves the domain of the density."""
+from mkc_torch.diagnosis.result import DensityCheck, DriverShift, EvidenceResult
 
 _DRIVEN_BY = "driven by"
 """Label of rows that are shown with the driver's name."""
@@ -58,6 +54,7 @@ def rows(evidence: Sequence[EvidenceResult], *, terminal: bool = False) -> list[
     """Return the other rows, with their labels.
 
     Example:
+        >>> from mkc_torch.diagnosis.result import Extrapolation
         >>> results = [EvidenceResult("extrapolation", Extrapolation(0.31, (0.28, 0.35)))]
         >>> rows(results)[0][0], rows(results, terminal=True)
         ('beyond its range', [])
@@ -95,26 +92,8 @@ def _driver_shift(result: EvidenceResult) -> Section:
 def _extrapolation(result: EvidenceResult) -> Section:
     low, high = result.value.confidence_interval
     verb = "improves the prediction" if low > 0.0 else "degrades the prediction" if high < 0.0 else "is not significant"
-    gain = _gain(result.value)
-    row = Row("beyond its range", f"fitted at low values of its driver, it {verb} at high values: {gain}", False)
-    return Section((row,))
-
-
-def _gain(extrapolation: Extrapolation) -> str:
-    """Format the gain with its interval, to two digits of its standard error.
-
-    Example:
-        >>> _gain(Extrapolation(-0.0212, (-0.12, 0.09)))
-        '-0.021 nats per sample (95 %: -0.120 to 0.090)'
-        >>> _gain(Extrapolation(3e6, (4.0, 9e6)))
-        'more than +1000 nats per sample'
-    """
-    if abs(extrapolation.log_likelihood_gain) > _FAR:
-        return f"{'more than +' if extrapolation.log_likelihood_gain > 0.0 else 'less than -'}{_FAR} nats per sample"
-    low, high = extrapolation.confidence_interval
-    places = max(1 - math.floor(math.log10(0.25 * (high - low))), 0) if high > low else 3
-    gain, low, high = (round(value, places) + 0.0 for value in (extrapolation.log_likelihood_gain, low, high))
-    return f"{gain:+.{places}f} nats per sample (95 %: {low:.{places}f} to {high:.{places}f})"
+    text = f"fitted at low values of its driver, it {verb} at high values"
+    return Section((Row("beyond its range", text, in_terminal=False),))
 
 
 def _density(result: EvidenceResult) -> Section:

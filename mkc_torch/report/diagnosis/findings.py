@@ -8,10 +8,11 @@ from collections.abc import Collection, Mapping, Sequence
 
 from mkc_torch._support.typesetting import plain, several, typeset
 from mkc_torch.diagnosis.environment import Grade, Run
-from mkc_torch.diagnosis.result import Alternative, CandidateScore, Finding, Region
+from mkc_torch.diagnosis.result import Alternative, CandidateScore, EffectParameter, Finding, Region
+from mkc_torch.diagnosis.vetoes import is_refused_by_blocks, refusal
 from mkc_torch.effects import is_curve, words_of
 from mkc_torch.report.diagnosis.evidence import of_driver
-from mkc_torch.report.diagnosis.numbers import TimeFormat, largest, probability
+from mkc_torch.report.diagnosis.numbers import TimeFormat, curve_lines, largest, probability
 from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
 
@@ -248,6 +249,8 @@ def grade(finding: Finding) -> str:
         return "not confirmed: impossible size"
     if finding.grade == "unconfirmed" and finding.held_out is None:
         return NOT_TESTED
+    if finding.grade == "unconfirmed" and not is_refused_by_blocks(finding):
+        return f"not confirmed: {refusal(finding)}"
     return _GRADES[finding.grade]
 
 
@@ -261,22 +264,35 @@ def shape(finding: Finding) -> str:
         >>> shape(right)
         'a free curve of the same variables is not clearly better (p = 0.4)'
         >>> shape(replace(right, shape=ShapeCheck(6.3, 0.005)))
-        'a free curve of the same variables gains only 6.30 nats (p = 0.005 if the name is right): the name is kept'
+        'a free curve of the same variables is only a little better (p = 0.005 if the name is right): the name is kept'
     """
     found = finding.shape
     if found is None:
         return ""
-    gain, p = size(found.free_curve_gain), probability(found.p_value)
+    p = probability(found.p_value)
     if found.curve is None and found.p_value > _USUAL_LEVEL:
         return f"a free curve of the same variables is not clearly better ({p})"
     if found.curve is None:
-        return f"a free curve of the same variables gains only {gain} nats ({p} if the name is right): the name is kept"
-    return f"a free curve of the same variables at the same port gains {gain} nats ({p} if the name is right)"
+        text = "a free curve of the same variables is only a little better"
+        return f"{text} ({p} if the name is right): the name is kept"
+    return f"a free curve of the same variables at the same port is clearly better ({p} if the name is right)"
 
 
 def inseparable(finding: Finding) -> tuple[Alternative, ...]:
     """Return the alternatives that the recording cannot distinguish from a finding."""
     return tuple(a for a in finding.alternatives if not a.separable)
+
+
+def stated_parameters(finding: Finding) -> tuple[EffectParameter, ...]:
+    """Return the parameters that are stated: of a curve those of its form, since its coefficients are no values."""
+    if not is_curve(finding.effect):
+        return finding.parameters
+    return tuple(parameter for parameter in finding.parameters if parameter.of_shape)
+
+
+def curve_values(finding: Finding) -> list[str]:
+    """Return values of a finding's curve where the recording has samples; empty for a named effect."""
+    return curve_lines(finding.curve) if is_curve(finding.effect) and finding.curve is not None else []
 
 
 def rivals(finding: Finding, *, sizes: bool = False) -> str:

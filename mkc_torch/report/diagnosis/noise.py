@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from mkc_torch._support.typesetting import plain, several
 from mkc_torch.diagnosis.result import Diagnosis, NoiseSummary, Number
+from mkc_torch.diagnosis.vetoes import counts
 from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.words.numbers import bandwidth, number, size
 
@@ -76,7 +77,7 @@ def channel_notes(channels: Sequence[str]) -> str:
 def held_out_rows(diagnosis: Diagnosis) -> list[tuple[str, list[str]]]:
     """Return RMSE, log-likelihood, σ and d of each model on held-out blocks."""
     rows = [("the simulation without findings", diagnosis.baseline)]
-    if diagnosis.findings:
+    if any(counts(finding) for finding in diagnosis.findings):
         rows.append(("with the findings", diagnosis.corrected))
     if diagnosis.ceiling is not None and _shown(diagnosis):
         rows.append(("with a smooth correction by all recorded columns", diagnosis.ceiling))

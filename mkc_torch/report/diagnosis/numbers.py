@@ -7,7 +7,10 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import torch
+
 from mkc_torch._support.typesetting import plain, superscript
+from mkc_torch.diagnosis.environment import Curve
 from mkc_torch.diagnosis.parts import SizeAtInput
 from mkc_torch.diagnosis.result import CandidateScore, EffectParameter, HeldOut, Number, Traces
 from mkc_torch.report.words.numbers import decimals, number, share, size
@@ -22,6 +25,12 @@ _MOST_PLACES = 9
 """Most decimals of an interval."""
 
 _MOST_NUMBERS = 12
+_CURVE_VALUES = 5
+"""Number of values that are stated of a curve."""
+
+_NORMAL_95 = 1.959964
+"""Half-width of a 95 % interval in standard errors."""
+
 _LONG = 4
 """Length from which only the largest number of a list is shown."""
 
@@ -211,6 +220,29 @@ def largest(parameter: EffectParameter) -> str:
     return f"{parameter_name(p)}, largest {_listed(p)[sizes.index(max(sizes))]}"
 
 
+def curve_lines(curve: Curve) -> list[str]:
+    """Return values of a curve with standard errors, at places where the recording has samples.
+
+    The coefficients of a curve are no values of it: outside the samples they can be of any size.
+
+    Example:
+        >>> x = torch.linspace(0.0, 2.0, 5)
+        >>> value = torch.stack([x, torch.tensor([0.0, 0.0, math.nan, 0.0, 0.0])], -1).sum(-1, keepdim=True)
+        >>> curve_lines(Curve("level", "m", x, value, torch.full_like(value, 0.0196), ("rate of level",), "m/s"))[:2]
+        ['at level 0 m: 0.000 ± 0.010 m/s', 'at level 0.500 m: 0.500 ± 0.010 m/s']
+    """
+    seen = curve.value.isfinite().all(-1).nonzero().squeeze(-1)
+    chosen = seen[torch.linspace(0, len(seen) - 1, min(_CURVE_VALUES, len(seen))).round().long()].tolist()
+    lines = []
+    for k in chosen:
+        value, error = (tuple(values[k].tolist()) for values in (curve.value, curve.band / _NORMAL_95))
+        place = f"{plain(curve.driver)} {size(float(curve.x[k]))} {plain(curve.unit)}".rstrip()
+        one = len(value) == 1
+        text = measured(value[0] if one else value, error[0] if one else error, curve.value_unit)
+        lines.append(f"at {place}: {' '.join(text)}")
+    return lines
+
+
 def at_input(size: SizeAtInput | None) -> str:
     """Format the size of an effect in the unit of the input that moves its rate; empty for an unknown size.
 
@@ -234,17 +266,17 @@ def probability(value: float) -> str:
 
 
 def evidence(value: float | None, surrogates: int) -> str:
-    """Format a p-value, with a note if it is the minimum for the number of surrogates; None is unknown.
+    """Format a p-value; the smallest possible with this number of surrogates is an upper limit. None is unknown.
 
     Example:
         >>> evidence(0.005, 199), evidence(0.02, 199), evidence(None, 0)
-        ('p = 0.005 (the minimum with 199 surrogates)', 'p = 0.02', 'unknown: no p-value was computed')
+        ('p = 0.005 or less', 'p = 0.02', 'unknown: no p-value was computed')
     """
     if value is None:
         return "unknown: no p-value was computed"
     if not _least(value, surrogates):
         return probability(value)
-    return f"{probability(value)} (the minimum with {surrogates:,} surrogates)"
+    return f"{probability(value)} or less"
 
 
 def _least(value: float, surrogates: int) -> bool:

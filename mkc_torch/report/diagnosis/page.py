@@ -19,6 +19,7 @@ from mkc_torch.report.diagnosis import (
     environment,
     evidence,
     findings,
+    first_picture,
     forcing_pictures,
     noise,
     numbers,
@@ -64,15 +65,17 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "", paths: verdict.Run
         HTML with inline figures.
     """
     d = diagnosis
+    shown = d.traces.courses is not None and len(d.traces.time) > 0
     count, driven = len(d.findings), min(len(d.environment.disturbance), _MOST_FORCINGS)
     works: list[Callable[[], str | None]] = [
+        lambda: first_picture.of_outputs(d) if shown else None,
         lambda: pictures.over_time(d) if len(d.traces.time) else None,
         *(partial(pictures.of_finding, d, i) for i in range(count)),
         *(partial(pictures.over_states, d, i) for i in range(count)),
         *(partial(forcing_pictures.of_shape, d, i) for i in range(count)),
         *(partial(forcing_pictures.of_forcing, d, i) for i in range(driven)),
     ]
-    time_figure, *drawn = (None if svg is None else Markup(svg) for svg in shared(works))
+    outputs_figure, time_figure, *drawn = (None if svg is None else Markup(svg) for svg in shared(works))
     page = render(
         "diagnosis.html.j2",
         d=d,
@@ -95,6 +98,9 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "", paths: verdict.Run
         notes=noise.channel_notes(d.traces.channels),
         numbered=pictures.numbered(d),
         clock=numbers.clock_of(d.traces),
+        first=first_picture,
+        corrected=first_picture.is_corrected(d),
+        outputs_figure=outputs_figure,
         time_figure=time_figure,
         figures=drawn[:count],
         maps=drawn[count : 2 * count],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -27,6 +28,7 @@ from mkc_torch.diagnosis.plot.drawings import (
     units_of_outputs,
 )
 from mkc_torch.diagnosis.result import Diagnosis, Finding, Traces
+from mkc_torch.diagnosis.vetoes import counts
 from mkc_torch.report.panels import Margins, Panels, title
 
 _MOST_ROWS, _MOST_ROWS_OF_ONE = 4, 3
@@ -48,20 +50,21 @@ class Panel:
 def over_time(diagnosis: Diagnosis) -> str:
     """Draw the residual over time, one row per channel, with onsets and intervals of the findings.
 
-    Without findings there is no column "after".
+    Without a finding that counts there is no column "after".
     """
     t, findings = diagnosis.traces, diagnosis.findings
+    corrected = any(counts(finding) for finding in findings)
     above, known = numbered(diagnosis), floors(diagnosis)
-    panels = Panels(2 if findings else 1, margins=Margins(top=0.55 if above else 0.35))
+    panels = Panels(2, margins=Margins(top=0.55 if above else 0.35))
     with style():
         for row in range(min(len(t.channels), _MOST_ROWS)):
-            axes = [panels.axes() for _ in MOMENTS[: 2 if findings else 1]]
+            axes = [panels.axes() for _ in MOMENTS[: 2 if corrected else 1]]
             for ax in axes:
                 mark_findings(ax, findings)
                 mark_rejected(ax, diagnosis.rejected_intervals)
             draw_residuals(axes, t, array(t.time), row, unit_of_channel(t, diagnosis.environment, row))
-            notes = ("", _enlarged(axes[-1], t, row)) if findings else ("",)
-            for ax, moment, note in zip(axes, MOMENTS if findings else ("residual",), notes, strict=True):
+            notes = ("", _enlarged(axes[-1], t, row)) if corrected else ("",)
+            for ax, moment, note in zip(axes, MOMENTS if corrected else ("residual",), notes, strict=True):
                 draw_floor(ax, known.get(t.channels[row]))
                 ax.set_xlabel(of_time(t.has_time))
                 title(ax, of_channel(moment, t.channels[row]) + note, above=above)
@@ -81,11 +84,11 @@ def _enlarged(ax: Any, t: Traces, channel: int) -> str:
 
 
 def floors(diagnosis: Diagnosis) -> dict[str, float]:
-    """Return the noise floor of each channel that is an output."""
+    """Return the known noise floor of each channel that is an output."""
     return {
         fit.output: fit.noise_floor
         for fit in diagnosis.environment.goodness_of_fit
-        if fit.output in diagnosis.traces.channels
+        if fit.output in diagnosis.traces.channels and math.isfinite(fit.noise_floor)
     }
 
 
@@ -108,7 +111,7 @@ def of_finding(diagnosis: Diagnosis, index: int) -> str | None:
         for row in rows:
             axes = [panels.axes() for _ in MOMENTS]
             unit = unit_of_channel(t, diagnosis.environment, row.channel)
-            draw_residuals(axes, t, array(t.drivers[row.driver]), row.channel, unit)
+            draw_residuals(axes, t, array(t.drivers[row.driver]), row.channel, unit, finding)
             for ax, moment in zip(axes, MOMENTS, strict=True):
                 title(ax, of_channel(moment, t.channels[row.channel]))
                 ax.set_xlabel(named(row.driver, t.driver_units.get(row.driver, "")))

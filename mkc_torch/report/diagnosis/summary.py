@@ -9,12 +9,12 @@ from mkc_torch._support.typesetting import capital, plain, typeset
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.effects import is_curve
 from mkc_torch.report.diagnosis.environment import noise_lines, output_lines
-from mkc_torch.report.diagnosis.findings import acts_on, finding_name, grade, inseparable, rivals, where
+from mkc_torch.report.diagnosis.findings import acts_on, curve_values, finding_name, grade, inseparable, rivals, where
 from mkc_torch.report.diagnosis.noise import noise_model, smooth_fit
-from mkc_torch.report.diagnosis.numbers import at_input, clock_of, evidence, gain, largest, probability
+from mkc_torch.report.diagnosis.numbers import at_input, clock_of, evidence, largest, probability
 from mkc_torch.report.diagnosis.unseen import better, diverged, residual_of_all, residuals
 from mkc_torch.report.diagnosis.verdict import reasons
-from mkc_torch.report.words.numbers import size
+from mkc_torch.report.words.numbers import factor, size
 
 Row = tuple[str, tuple[str, ...]]
 """Label and lines of a row; backticks mark code."""
@@ -29,7 +29,7 @@ def summary(diagnosis: Diagnosis) -> list[Row]:
     if d.verdict == "unfit":
         return [*rows, *([_row("why", *reasons(d))] if d.environment.reasons else []), *suspected]
     noise = _row("noise", *(noise_lines(d) or [f"{capital(noise_model(d.noise))}."]))
-    rows += [noise, *_of_findings(d)] if follows else [*_of_findings(d), noise]
+    rows = [*_of_findings(d), *rows, noise]
     smooth = "" if d.findings else smooth_fit(d)
     if smooth:
         rows.append(_row("for comparison", f"{capital(smooth)}."))
@@ -64,7 +64,7 @@ def _of_findings(diagnosis: Diagnosis) -> Iterator[Row]:
     if f.held_out is None:
         yield _row("how much better", f"Not measured: {_closed(f.held_out_note)}")
         return
-    sure = f"{capital(better(f.held_out))}; {gain(f.held_out)}."
+    sure = f"{capital(better(f.held_out))}."
     sizes = [f"On held-out data: {residual}." for residual in residuals(f.held_out, d.environment)]
     yield _row("how much better", *sizes, sure, *filter(None, [diverged(f.held_out)]))
 
@@ -73,10 +73,8 @@ def _process_noise_evidence(diagnosis: Diagnosis) -> Iterator[str]:
     """State the evidence for process noise, and that no physics is significant."""
     known = [process for process in diagnosis.environment.process_noise if math.isfinite(process.log_likelihood_gain)]
     if known:
-        yield (
-            f"A model without this noise of `{plain(known[0].place)}` is "
-            f"{size(known[0].log_likelihood_gain)} nats less likely."
-        )
+        less = factor(known[0].log_likelihood_gain)
+        yield f"A model without this noise of `{plain(known[0].place)}` is less likely by {less}."
         if diagnosis.p_value is not None and diagnosis.p_value > diagnosis.level:
             yield "No physics is significant in addition to it."
 
@@ -98,9 +96,10 @@ def _in_short(finding: Finding, diagnosis: Diagnosis) -> Iterator[str]:
 
 
 def _sizes(finding: Finding, most: int) -> str:
-    """Format the first parameters; empty for a curve, which its figure shows."""
+    """Format the first parameters; of a curve its values at the first and the last place with samples."""
     if is_curve(finding.effect):
-        return ""
+        values = curve_values(finding)
+        return "; ".join(dict.fromkeys([*values[:1], *values[-1:]]))
     return "; ".join(filter(None, [*(largest(p) for p in finding.parameters[:most]), at_input(finding.at_input)]))
 
 

@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.held_out_gain import (
 )
 from mkc_torch.diagnosis.result import Diagnosis, HeldOut, ResidualSizes
 from mkc_torch.diagnosis.thresholds import SMALL
+from mkc_torch.diagnosis.vetoes import counts
 from mkc_torch.report.diagnosis.numbers import improvement
 from mkc_torch.report.words.numbers import size
 
@@ -146,16 +147,20 @@ def _of_output(name: str, sizes: ResidualSizes, environment: NoiseEnvironment) -
 
 
 def residual_of_all(diagnosis: Diagnosis) -> list[str]:
-    """Return the residuals without findings and with all findings; empty if outputs of several units share a number."""
+    """Return the residuals without findings and with those that count; empty if none counts.
+
+    Also empty if the residuals of the outputs are not known and outputs of several units share a number.
+    """
     d = diagnosis
-    held = [f.held_out for f in d.findings if f.held_out is not None]
-    if len(held) == len(d.findings) and all(held_out.outputs for held_out in held) and held:
-        first, last = held[0].outputs, held[-1].outputs
-        both = {
-            name: ResidualSizes(sizes.before, last[name].after, sizes.unit)
-            for name, sizes in first.items()
-            if name in last
-        }
+    if not any(counts(finding) for finding in d.findings):
+        return []
+    after = d.corrected.outputs
+    both = {
+        name: ResidualSizes(size.rmse, after[name].rmse, size.unit)
+        for name, size in d.baseline.outputs.items()
+        if name in after
+    }
+    if both:
         return [_of_output(name, sizes, d.environment) for name, sizes in both.items()]
     if len(d.traces.channels) > 1 and not d.traces.unit:
         return []

@@ -26,10 +26,10 @@ def candidate_line(candidate: CandidateScore) -> str:
 
     Example:
         >>> candidate_line(CandidateScore("linear_drag", (), "", 4.46, 3.0, "rate of speed", 0.0))
-        'linear drag on the rate of speed: +4.46 nats, not tested'
+        'linear drag on the rate of speed: gain 4.46, not tested'
     """
     name = with_drivers(candidate.effect, candidate.drivers, candidate.port)
-    return f"{name}: +{size(candidate.log_likelihood_gain)} nats, not tested"
+    return f"{name}: gain {size(candidate.log_likelihood_gain)}, not tested"
 
 
 def untested_table(diagnosis: Diagnosis) -> Table | None:

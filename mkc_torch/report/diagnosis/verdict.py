@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import shlex
 from collections.abc import Sequence
@@ -10,11 +9,11 @@ from typing import NamedTuple
 
 from mkc_torch._support.typesetting import capital, plain, several
 from mkc_torch.diagnosis.result import UNFINISHED, VERDICT_SENTENCES, Diagnosis, Finding, notices
-from mkc_torch.diagnosis.verdict import DiagnosisDoubt, Status, conclusion, doubted_signs, rejected_share
-from mkc_torch.diagnosis.vetoes import is_small, transfers, worth_correcting
+from mkc_torch.diagnosis.verdict import Answer, DiagnosisDoubt, conclusion, doubted_signs, rejected_share
+from mkc_torch.diagnosis.vetoes import is_refused_by_blocks, is_small, transfers, worth_correcting
 from mkc_torch.report.diagnosis.findings import NOT_TESTED, finding_name, inseparable, rivals, unrecorded, with_names
 from mkc_torch.report.diagnosis.unseen import residual_of_all
-from mkc_torch.report.words.numbers import share, size
+from mkc_torch.report.words.numbers import share
 from mkc_torch.report.words.verdict import disturbed
 
 _MOST_REJECTED = "Most samples were rejected"
@@ -35,9 +34,9 @@ class RunPaths(NamedTuple):
     options: tuple[str, ...]
 
 
-def status(diagnosis: Diagnosis) -> Status:
-    """Return the status of the headline."""
-    return conclusion(diagnosis).status
+def answer_word(diagnosis: Diagnosis) -> Answer:
+    """Return the answer in one word, by which the headline is coloured."""
+    return conclusion(diagnosis).answer
 
 
 _LOOK: dict[DiagnosisDoubt, str] = {
@@ -95,7 +94,7 @@ def _verdict(diagnosis: Diagnosis) -> str:
 
 def _found(findings: Sequence[Finding]) -> str:
     sentences = []
-    for kind in (_LEFT_OUT, _NEAREST, _SMALL, _NOT_TESTED, _UNCONFIRMED, _BOTH, _CANNOT_BE):
+    for kind in (_LEFT_OUT, _NEAREST, _SMALL, _NOT_TESTED, _UNCONFIRMED, _BOTH, _REFUSED, _CANNOT_BE):
         of_it = [f for f in findings if _kind(f) == kind]
         if of_it:
             names = "; ".join(_named(f, alone=len(findings) == 1) for f in of_it)
@@ -104,6 +103,7 @@ def _found(findings: Sequence[Finding]) -> str:
 
 
 _LEFT_OUT, _NEAREST = "Left out of the simulation: {findings}.", "Nearest in the catalogue: {findings}."
+_REFUSED = "Found, but not confirmed: {findings}."
 _CANNOT_BE = "Found, but of an impossible size: {findings}."
 _NOT_TESTED = f"Found, but {NOT_TESTED}: {{findings}}."
 _SMALL, _UNCONFIRMED, _BOTH = (
@@ -119,6 +119,8 @@ def _kind(finding: Finding) -> str:
         return _CANNOT_BE
     if finding.grade == "unconfirmed" and finding.held_out is None:
         return _NOT_TESTED
+    if finding.grade == "unconfirmed" and not is_refused_by_blocks(finding):
+        return _REFUSED
     if finding.grade == "unconfirmed":
         return _BOTH if is_small(finding) else _UNCONFIRMED
     return {"left_out": _LEFT_OUT, "small": _SMALL}.get(finding.grade, _NEAREST)
@@ -127,8 +129,7 @@ def _kind(finding: Finding) -> str:
 def _named(finding: Finding, *, alone: bool) -> str:
     name, others = finding_name(finding), inseparable(finding)
     if finding.grade == "nearest":
-        gain = finding.shape.free_curve_gain if finding.shape is not None else math.nan
-        return f"{name} (a free curve of the same variables gains {size(gain)} nats)" if math.isfinite(gain) else name
+        return f"{name} (a free curve of the same variables is clearly better)"
     if not others:
         return name
     if not alone:
@@ -248,12 +249,12 @@ def _ids(diagnosis: Diagnosis) -> set[str]:
 
 
 def apply_command(diagnosis: Diagnosis, paths: RunPaths | None = None) -> str:
-    """Return the command that corrects a recording; empty if no finding transfers.
+    """Return the command that corrects a recording; empty if no finding transfers, or the residual is not smaller.
 
     ``paths`` are those of the run; None if they are unknown.
     """
     d = diagnosis
-    if not any(transfers(f) for f in d.findings):
+    if not any(transfers(f) for f in d.findings) or "not_better" in conclusion(d).doubts:
         return ""
     own = {
         "magnetometer": " --output corrected.csv",

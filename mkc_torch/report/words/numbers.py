@@ -13,6 +13,12 @@ _MOST_DECIMALS = 9
 _LEAST, _MOST = 0.01, 1e6
 """Range of sizes that are written without a power of ten."""
 
+_MILLION = math.log(1e6)
+"""Gain in nats above which the ratio of the likelihoods is not stated in digits."""
+
+_AS_LIKELY = 0.05
+"""Gain in nats below which two models are as likely."""
+
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -117,6 +123,20 @@ def listed(values: Sequence[float], errors: Sequence[float], exponent: int = 0) 
     return ", ".join(
         number(v / scale, decimals(max(filter(math.isfinite, errors), default=math.nan) / scale)) for v in values
     )
+
+
+def factor(log_likelihood_gain: float) -> str:
+    """Format a gain of log-likelihood as the ratio of the likelihoods.
+
+    Example:
+        >>> factor(0.0), factor(1.3), factor(5.0), factor(311.0)
+        ('nothing', 'a factor of 3.7', 'a factor of 150', 'a factor of more than a million')
+    """
+    if log_likelihood_gain < _AS_LIKELY:
+        return "nothing"
+    if log_likelihood_gain > _MILLION:
+        return "a factor of more than a million"
+    return f"a factor of {float(f'{math.exp(log_likelihood_gain):.2g}'):,g}"
 
 
 def share(value: float) -> str:

@@ -10,7 +10,7 @@ pytest.importorskip("jsonschema")
 from mkc_torch.density import ChannelTails
 from mkc_torch.diagnosis.evidence import prediction, residual_noise, timing
 from mkc_torch.diagnosis.io.diagnosis_json import DiagnosisFileError, diagnosis_to_json, json_schema, validate
-from mkc_torch.diagnosis.parts import SizeAtInput
+from mkc_torch.diagnosis.parts import OutputSize, SizeAtInput
 from mkc_torch.diagnosis.result import (
     DensityCheck,
     DriverShift,
@@ -64,6 +64,18 @@ def test_keys_are_those_of_the_format(content):
         "p_value", "shape", "held_out", "held_out_note", "alternatives", "plausible", "plausibility", "advice",
     }  # fmt: skip
     assert set(content["baseline"]) == {"log_likelihood", "rmse", "sigma", "d"}
+
+
+def test_the_scores_have_the_size_of_each_output_in_its_unit_if_known():
+    made = make_diagnosis(1)
+    sizes = {"angle": OutputSize(0.02, "rad"), "rate": OutputSize(0.3, "rad/s")}
+    changed = dataclasses.replace(made, corrected=dataclasses.replace(made.corrected, outputs=sizes))
+    content = written(changed)
+    assert content["corrected"]["outputs"]["rate"] == {"rmse": 0.3, "unit": "rad/s"}
+    assert "outputs" not in content["baseline"]
+    content["corrected"]["outputs"]["rate"]["rmse"] = -1.0
+    with pytest.raises(DiagnosisFileError, match=r"corrected\.outputs\.rate\.rmse"):
+        validate(content)
 
 
 def test_the_ceiling_has_scores_and_density_in_the_file():

@@ -8,7 +8,7 @@ import pytest
 from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
 from mkc_torch.diagnosis.verdict import conclusion, rejected_share
-from mkc_torch.report.diagnosis.verdict import headline, status
+from mkc_torch.report.diagnosis.verdict import answer_word, headline
 from tests.diagnosis.factory import make_diagnosis
 
 
@@ -29,7 +29,7 @@ def test_findings_that_do_not_reduce_the_residual_are_a_doubt_in_the_headline():
     worse = dataclasses.replace(found, corrected=dataclasses.replace(found.corrected, rmse=1.2 * found.baseline.rmse))
     assert conclusion(worse).doubts == ("not_better",)
     assert headline(worse).startswith("Doubtful: the findings do not make the residual smaller (")
-    assert status(worse) == "open"
+    assert answer_word(worse) == "look"
     assert json.loads(diagnosis_to_json(worse))["doubts"] == ["not_better"]
 
 

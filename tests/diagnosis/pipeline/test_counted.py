@@ -5,9 +5,14 @@ import dataclasses
 import pytest
 import torch
 
+from mkc_torch.diagnosis.evidence.base import EvidenceContext
+from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out, on_all
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.pipeline.counted import counted_fit, counts, left_out_note
+from mkc_torch.diagnosis.pipeline.counted import corrected_model, counted_fit, left_out_note, scores_of
+from mkc_torch.diagnosis.search.estimate import rough_estimate
+from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.diagnosis.vetoes import counts
 from tests.diagnosis.cart import DRAG, cart_terms, free_fit
 from tests.diagnosis.factory import make_diagnosis
 
@@ -37,6 +42,63 @@ def test_findings_that_do_not_count_are_left_out_and_the_rest_is_fitted_again(fi
     assert float((final.parameters[-2] - drag.parameters[-1]).abs()) > 1e-3
     assert counted_fit(final, alone, [0, 1, 2]) is final
     assert counted_fit(final, alone, []) is alone
+
+
+class Located:
+    """A search result that has a fit only."""
+
+    def __init__(self, fit):
+        self.fit = fit
+
+
+@pytest.fixture(scope="module")
+def case(fits):
+    """The fits without effects, with the force, with the drag, and with the damping, and their scores."""
+    alone, _, final = fits
+    terms, prepared = final.model.terms, alone.model.prepared
+    blocks = blocks_of(len(alone.residual), 1, Settings().confirmation)
+
+    def fit(count):
+        model = JointModel(prepared, terms[:count])
+        zeros = alone.parameters.new_zeros(model.size - alone.model.size)
+        return fitted(model, torch.cat([alone.parameters, zeros]), alone.bound)
+
+    steps = [alone, fit(1), fit(2), final]
+    scores = tuple(held_out(step, blocks) for step in steps)
+    found = tuple(Located(step) for step in steps[1:])
+    estimate = rough_estimate(final, scores[-1].jackknife)
+    return EvidenceContext(alone, None, found, scores, blocks, (), 0, Settings(), estimate=estimate)
+
+
+@pytest.mark.e2e
+def test_the_corrected_scores_are_those_of_the_findings_that_count(fits, case):
+    alone, drag, final = fits
+    whole = corrected_model(alone, case, [0, 1, 2])
+    assert whole.exported is whole.fit is final
+    assert whole.evidence is case.held_out[-1]
+    nothing = corrected_model(alone, case, [])
+    assert (nothing.exported, nothing.fit, nothing.evidence) == (alone, alone, case.held_out[0])
+    assert scores_of(case, nothing)[0] == scores_of(case, nothing)[1]
+    leading = corrected_model(alone, case, [0])
+    assert leading.evidence is case.held_out[1]
+    some = corrected_model(alone, case, [1])
+    assert [term.effect.id for term in some.exported.model.terms] == ["quadratic_drag"]
+    # as if the drag had been the only finding
+    expected = held_out(drag, case.blocks)
+    torch.testing.assert_close(some.evidence.residual, expected.residual, rtol=0.0, atol=2e-3)
+    baseline, corrected = scores_of(case, some)
+    assert corrected.outputs["speed"].rmse < 0.5 * baseline.outputs["speed"].rmse
+    assert corrected.outputs["speed"].unit == baseline.outputs["speed"].unit
+
+
+@pytest.mark.e2e
+def test_without_time_the_corrected_scores_are_those_before_the_first_finding_that_does_not_count(fits, case):
+    alone, *_ = fits
+    stopped = corrected_model(alone, case, [1, 2], limit_s=0.0)
+    assert stopped.evidence is case.held_out[0]
+    # in a quick look nothing is held out, neither for the corrected model
+    quick = dataclasses.replace(case, held_out=tuple(on_all(fit) for fit in case.fits))
+    assert len(corrected_model(alone, quick, [1]).evidence.parameters) == 1
 
 
 def test_an_unconfirmed_finding_does_not_count_and_is_named_and_an_untested_one_counts():
