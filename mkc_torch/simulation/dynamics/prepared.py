@@ -70,7 +70,8 @@ class PreparedDynamics(CheckedDynamics):
         self.run = experiment_runs(self.recording)
         self.known_inputs = InputRows.of(recording, system.inputs, sampled, self.begins)
         self.inputs_at_rows = self.known_inputs.inputs[self.known_inputs.samples]
-        self.input_hold = dict.fromkeys(system.inputs, system.input_hold)
+        # a simulation that steps holds its inputs over each step; there is no choice
+        self.input_hold = dict.fromkeys(system.inputs, system.input_hold) if system.steps is None else {}
         refuse_few(self.begins, system.name)
         self.kinematic = kinematic(system, self.known)
         self._lay_out(1)
@@ -112,7 +113,7 @@ class PreparedDynamics(CheckedDynamics):
         known = self.known_inputs
         columns = [
             inputs_between(inputs[:, [k]], how, known.time, known.begins, self._input_clock)
-            for k, how in enumerate(self.input_hold.values())
+            for k, how in enumerate((dict.fromkeys(self.system.inputs, self.system.input_hold) | self.input_hold).values())
         ]
         return torch.cat(columns, -1) if columns else inputs.new_zeros(len(self.clock.time), 0)
 
