@@ -42,4 +42,6 @@ def mjcf_source(
             continue
         added[joint, attribute] = added.get((joint, attribute), 0.0) + float(gamma[0])
     values = dict(zip(system.parameters, theta, strict=False))
-    return corrected_xml(system.description, values, added), tuple(others)
+    only = f" Only corrected.py has: {'; '.join(others)}." if others else ""
+    note = f"With the findings of mkc diagnose.{only}".replace("--", "-")  # a comment cannot hold two hyphens
+    return corrected_xml(system.description, values, added, note), tuple(others)

@@ -111,9 +111,10 @@ class PreparedDynamics(CheckedDynamics):
     def _between(self, inputs: Float[Tensor, "R u"]) -> Float[Tensor, "S u"]:
         """Inputs at the stations."""
         known = self.known_inputs
+        holds = dict.fromkeys(self.system.inputs, self.system.input_hold) | self.input_hold
         columns = [
             inputs_between(inputs[:, [k]], how, known.time, known.begins, self._input_clock)
-            for k, how in enumerate((dict.fromkeys(self.system.inputs, self.system.input_hold) | self.input_hold).values())
+            for k, how in enumerate(holds.values())
         ]
         return torch.cat(columns, -1) if columns else inputs.new_zeros(len(self.clock.time), 0)
 

@@ -131,6 +131,40 @@ def test_the_corrected_file_has_the_new_numbers_and_nothing_else(two_links):
     assert values["elbow_frictionloss"] == 0.07
 
 
+def test_a_finding_that_mjcf_cannot_express_is_named_in_the_file(two_links):
+    from mkc_torch.diagnosis.io.mjcf import mjcf_source
+    from mkc_torch.diagnosis.model.term import Term
+    from mkc_torch.effects import CATALOGUE
+
+    named = {effect.id: effect for effect in CATALOGUE if effect.id in ("coulomb_friction", "input_delay")}
+    terms = [
+        Term(named["coulomb_friction"], None, {"width": 0.05}, "entry of elbow_force"),
+        Term(named["input_delay"], None, {"delay": 0.04}, "input shoulder_ctrl"),
+    ]
+    sizes = [torch.tensor([0.08]), torch.tensor([1.0])]
+    system = load_mjcf(two_links)
+    theta = [parameter.value for parameter in system.parameters.values()]
+    text, others = mjcf_source(system, theta, terms, sizes)
+    assert 'frictionloss="0.08"' in text
+    assert len(others) == 1
+    assert "shoulder_ctrl" in others[0]
+    assert f"Only corrected.py has: {others[0]}." in text
+
+
+def test_the_example_recording_has_the_columns_that_a_diagnosis_needs(two_links):
+    from mkc_torch.simulation.stepped.mujoco.example import example_recording
+
+    recording = Recording(example_recording(two_links))
+    prepared = load_mjcf(two_links).prepare(recording)
+    assert prepared.channels == ("shoulder", "elbow")
+    theta = prepared.given
+    theta[-2:] = 0.0
+    assert prepared.residual(theta, {}).abs().max() < 1e-9
+    (two_links.parent / "idle.xml").write_text(FREE.replace("<freejoint name=", "<joint name="))
+    with pytest.raises(MjcfError, match="the model has no actuator, and nothing drives it"):
+        example_recording(two_links.parent / "idle.xml")
+
+
 def test_a_class_of_a_model_is_found_next_to_the_calling_file(two_links):
     kind = mjcf_class("elsewhere/two_links.xml", str(two_links.parent / "corrected.py"))
     assert kind().states == load_mjcf(two_links).states

@@ -12,13 +12,16 @@ from mkc_torch.simulation.stepped.mujoco.description import Description
 _OF_ACTUATORS = {"actuator_gainprm": "gainprm", "actuator_biasprm": "biasprm"}
 
 
-def corrected_xml(description: Description, values: Mapping[str, float], added: Mapping[tuple[str, str], float]) -> str:
+def corrected_xml(
+    description: Description, values: Mapping[str, float], added: Mapping[tuple[str, str], float], note: str = ""
+) -> str:
     """Return the model as MJCF with other numbers.
 
     Args:
         description: the model.
         values: fitted number by parameter name.
         added: joint and attribute, ("elbow", "frictionloss") say, to what is added to the attribute, in its unit.
+        note: appended to the comment at the top of the file.
 
     Example:
         >>> from pathlib import Path
@@ -45,6 +48,8 @@ def corrected_xml(description: Description, values: Mapping[str, float], added: 
     for (joint, attribute), amount in added.items():
         part = spec.joints[joints.index(joint)]
         _set(part, attribute, _linear(getattr(part, attribute)) + amount)
+    if note:
+        spec.comment = f"{spec.comment} {note}".strip()
     text: str = spec.to_xml()
     return text
 
