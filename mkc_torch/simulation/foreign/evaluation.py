@@ -81,7 +81,7 @@ class CachedEvaluation:
         raise NotImplementedError
 
     def fresh(self, outputs: bool, rows: tuple[Array, Array, Array], parameters: Array) -> Array:
-        """The rates or the outputs, (S, k), computed anew at times (S,), states (S, n) and inputs (S, m)."""
+        """The rates or the outputs, (S, k), computed at times (S,), states (S, n) and inputs (S, m)."""
         raise NotImplementedError
 
     def columns(

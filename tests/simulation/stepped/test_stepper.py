@@ -92,7 +92,7 @@ def test_a_gap_between_samples_has_as_many_steps_as_it_lasts():
     )
 
 
-def test_runs_start_anew_and_forces_are_no_columns():
+def test_each_run_has_its_own_start_and_forces_are_no_columns():
     two = torch.arange(60) // 30
     recording = recording_of(experiment=two.double())
     prepared = Steps().prepare(recording)
