@@ -25,7 +25,7 @@ def apply(
         str | None,
         typer.Option(
             metavar="FILE.py:CLASS",
-            help="Your diagnosed simulation, or MODEL.fmu; its code is run.",
+            help="Your diagnosed simulation, MODEL.fmu or MODEL.xml; its code is run.",
         ),
     ] = None,
     simulator_output: Annotated[

@@ -38,6 +38,7 @@ from mkc_torch.cli.loading import loading
 from mkc_torch.cli.simulation_option import (
     COLUMNS_HELP,
     COLUMNS_METAVAR,
+    FIT_HELP,
     INPUT_HOLD_HELP,
     OWN_SIMULATION,
     RUN_COLUMN_HELP,
@@ -46,6 +47,7 @@ from mkc_torch.cli.simulation_option import (
     checked_sensor,
     checked_simulation,
     checked_units,
+    parsed_fit,
 )
 from mkc_torch.cli.steps import Steps
 from mkc_torch.cli.units_option import (
@@ -105,6 +107,10 @@ def diagnose(
         list[str] | None,
         typer.Option(metavar="NAME=HOLD", help=INPUT_HOLD_HELP),
     ] = None,
+    fit: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NUMBERS", help=FIT_HELP),
+    ] = None,
     suspect: Annotated[
         list[str] | None,
         typer.Option(metavar="EFFECTS", help=f"Suspected effects to score next to the findings: {SUSPECTED}."),
@@ -145,6 +151,7 @@ def diagnose(
         sensor=checked_sensor(sensor, simulation),
         noise=_noise(noise or []),
         input_hold=checked_input_hold(input_hold or []),
+        fit=parsed_fit(fit or [], simulation),
         suspect=tuple(suspect or []),
         level=_level(level),
         surrogates=_surrogates(surrogates, level, quick=quick),

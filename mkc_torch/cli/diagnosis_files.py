@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from mkc_torch.simulation import Simulation
 
 _EXPERIMENT = "experiment"
-WRITTEN = ("diagnosis.json", "model.json", "corrected.py", "report.html")
+WRITTEN = ("diagnosis.json", "model.json", "corrected.py", "corrected.xml", "report.html")
 
 
 def diagnose_file(
@@ -172,8 +172,9 @@ def write_diagnosis(
 ) -> tuple[Diagnosis, list[Path]]:
     """Write diagnosis.json, model.json and report.html into a folder.
 
-    Differential equations also get corrected.py, the simulation with the findings. ``note`` is shown in the report. A
-    file whose text ends in an internal error is left out, with a warning in the other files.
+    Differential equations also get corrected.py, the simulation with the findings, and a model of MuJoCo also
+    corrected.xml. ``note`` is shown in the report. A file whose text ends in an internal error is left out, with a
+    warning in the other files.
 
     Returns:
         The diagnosis with these warnings, and the written files.
@@ -186,6 +187,7 @@ def write_diagnosis(
     if model is not None:
         made["model.json"] = lambda _: model.to_json()
         made["corrected.py"] = lambda _: model.to_python(folder=folder)
+        made["corrected.xml"] = lambda _: model.to_mjcf()[0]
     # the files with warnings come last
     if report:
         made["report.html"] = lambda d: diagnosis_report(d, note=note, paths=paths)
@@ -195,7 +197,7 @@ def write_diagnosis(
         text, warnings = _text_of(name, text_of, diagnosis)
         texts |= {} if text is None else {name: text}
         diagnosis = replace(diagnosis, warnings=(*diagnosis.warnings, *warnings)) if warnings else diagnosis
-    for name in {"model.json", "corrected.py", *made} - set(texts):
+    for name in {"model.json", "corrected.py", "corrected.xml", *made} - set(texts):
         (folder / name).unlink(missing_ok=True)  # a file of an earlier diagnosis
     files = [name for name in WRITTEN if name in texts]
     for name in files:
@@ -284,15 +286,19 @@ def _paths(path: Path, folder: Path, request: Request) -> RunPaths | None:
     return RunPaths(str(path), str(folder / "model.json"), tuple(options))
 
 
-def named_simulation(name: str) -> Simulation:
-    """Return the magnetometer, or load the user's simulation ``FILE.py:NAME``.
+def named_simulation(name: str, fitted: Sequence[str] = ()) -> Simulation:
+    """Return the magnetometer, or load the user's simulation.
+
+    Args:
+        name: as for ``--simulation``.
+        fitted: for a model of MuJoCo, patterns of the numbers to fit; empty for those that the file gives.
 
     Raises:
         SimulationFileError: the file cannot be used.
     """
     from mkc_torch.simulation import Magnetometer
 
-    return Magnetometer() if name == MAGNETOMETER else load_simulation(name)
+    return Magnetometer() if name == MAGNETOMETER else load_simulation(name, fitted)
 
 
 def paired_simulation(path: Path, columns: Mapping[str, str]) -> Simulation:
@@ -316,7 +322,7 @@ def simulation_of(request: Request) -> Simulation:
     """
     if request.simulator_output is not None:
         return paired_simulation(request.simulator_output, request.columns)
-    return named_simulation(request.simulation)
+    return named_simulation(request.simulation, request.fit)
 
 
 def _failed(path: Path, label: str, error: Exception) -> Outcome:

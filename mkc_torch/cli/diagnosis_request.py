@@ -38,6 +38,7 @@ class Request:
     sensor: str | None = None
     noise: Mapping[str, float] = field(default_factory=dict)
     input_hold: Mapping[str, str] = field(default_factory=dict)
+    fit: tuple[str, ...] = ()
     suspect: tuple[str, ...] = ()
     level: float = LEVEL
     surrogates: int = SURROGATES
@@ -75,7 +76,7 @@ class Outcome:
 
 
 def is_file_of_a_simulation(name: str) -> bool:
-    """Whether ``--simulation`` names a file, whose code is run: ``FILE.py:CLASS``, ``FILE.py`` or ``MODEL.fmu``.
+    """Whether ``--simulation`` names a file: ``FILE.py:CLASS``, ``FILE.py``, ``MODEL.fmu``, or a model of MuJoCo.
 
     Example:
         >>> is_file_of_a_simulation("my.py:Pendulum"), is_file_of_a_simulation("arm.fmu")
@@ -83,4 +84,14 @@ def is_file_of_a_simulation(name: str) -> bool:
         >>> is_file_of_a_simulation("magnetometer")
         False
     """
-    return ".py:" in name or name.casefold().endswith((".py", ".fmu"))
+    return ".py:" in name or name.casefold().endswith((".py", ".fmu")) or is_model_of_mujoco(name)
+
+
+def is_model_of_mujoco(name: str) -> bool:
+    """Whether ``--simulation`` names a model of MuJoCo, MJCF or URDF.
+
+    Example:
+        >>> is_model_of_mujoco("arm.xml"), is_model_of_mujoco("my.py:Pendulum")
+        (True, False)
+    """
+    return name.casefold().endswith((".xml", ".urdf", ".mjcf"))

@@ -29,6 +29,7 @@ EXTRAS = (
     Extra("lightning", "the callback for Lightning", ("lightning",)),
     Extra("sklearn", "estimators in pipelines of scikit-learn", ("scikit-learn",)),
     Extra("fmu", "simulations in FMUs", ("fmpy",)),
+    Extra("mujoco", "models of MuJoCo as simulations", ("mujoco",)),
     Extra("parquet", "streamed fits of Parquet files", ("pyarrow",)),
     Extra("wmm", "the Earth's field at a place, for --place", ("ahrs",)),
     Extra("ulog", "logs of PX4", ("pyulog", "polars")),

@@ -20,9 +20,41 @@ Folder = Annotated[Path, typer.Option(help="Folder to write into.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 
 
-def new_simulation(name: Name, output: Folder = Path(), force: Force = False) -> None:
-    """Write NAME.py, a template for your own simulation, and test_NAME.py, which simulates and diagnoses it."""
-    _write("simulation", name, output, force=force)
+Model = Annotated[
+    Path | None,
+    typer.Option(
+        "--from", metavar="MODEL.xml", help="A model for MuJoCo: write NAME.csv, a recording with its columns, instead."
+    ),
+]
+
+
+def new_simulation(name: Name, output: Folder = Path(), model: Model = None, force: Force = False) -> None:
+    """Write NAME.py, a template for your own simulation, and test_NAME.py, which simulates and diagnoses it.
+
+    With --from, write NAME.csv instead: 20 s simulated by a model for MuJoCo, with the columns that a recording needs.
+    """
+    if model is None:
+        _write("simulation", name, output, force=force)
+    else:
+        _write_recording(model, output / f"{name}.csv", force=force)
+
+
+def _write_recording(model: Path, target: Path, *, force: bool) -> None:
+    """Write a recording simulated by a model for MuJoCo, and print the command that diagnoses such a recording."""
+    from mkc_torch.recording import write_table
+    from mkc_torch.simulation.stepped.mujoco.example import example_recording
+
+    try:
+        if target.exists() and not (force and target.is_file()):
+            raise FileExistsError(f"{target} exists; choose another name, or replace it with `--force`.")
+        columns = example_recording(model)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_table(target, columns, overwrite=force)
+    except (*FAILURES, ImportError) as error:
+        complain(model, error)
+        raise typer.Exit(1) from None
+    out().print(f"{target}: {', '.join(columns)}", soft_wrap=True)
+    out().print(f"mkc diagnose YOURS.csv --simulation {model}", soft_wrap=True)
 
 
 def new_effect(name: Name, output: Folder = Path(), force: Force = False) -> None:

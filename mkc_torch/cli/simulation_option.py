@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import typer
 
 from mkc_torch.cli.console import parsed_columns, parsed_pairs
-from mkc_torch.cli.diagnosis_request import INPUT_HOLDS, MAGNETOMETER, SIMULATIONS, is_file_of_a_simulation
+from mkc_torch.cli.diagnosis_request import (
+    INPUT_HOLDS,
+    MAGNETOMETER,
+    SIMULATIONS,
+    is_file_of_a_simulation,
+    is_model_of_mujoco,
+)
 from mkc_torch.cli.units_option import parsed_units
 
-OWN_SIMULATION = "FILE.py:CLASS, FILE.py with a single class, or MODEL.fmu. The code in the file is run."
+OWN_SIMULATION = (
+    "FILE.py:CLASS, FILE.py with a single class, MODEL.fmu, or a model of MuJoCo, MODEL.xml or MODEL.urdf. The code in "
+    "the file is run."
+)
 """The forms of ``--simulation`` that name a file, for its help."""
 
 COLUMNS_METAVAR = "NAME=COLUMN,..."
 COLUMNS_HELP = "Names of the columns in the file: mag_x=mx,temperature=IMU_T"
 INPUT_HOLD_HELP = f"Known course of an input between samples: {', '.join(INPUT_HOLDS)}."
 SIZES_OF_HELP = "Diagnosed recording whose sizes apply, where a size differs between recordings."
+FIT_HELP = (
+    "Numbers of a model of MuJoCo to fit: joint:*.damping,actuator:*.kp; default: damping, armature, frictionloss, kp "
+    "and kv that the file gives."
+)
 RUN_COLUMN_HELP = "Column that separates the runs of a table; default: experiment, if any."
 
 
@@ -37,7 +51,7 @@ def checked_simulation(simulation: str | None, simulator_output: Path | None) ->
     if simulation is not None and simulation not in SIMULATIONS and not is_file_of_a_simulation(simulation):
         raise typer.BadParameter(
             f'--simulation "{simulation}" is unknown; give {", ".join(SIMULATIONS)}, or your own simulation as '
-            "FILE.py:CLASS or MODEL.fmu."
+            "FILE.py:CLASS, MODEL.fmu or MODEL.xml."
         )
     return simulation or ""
 
@@ -60,6 +74,24 @@ def checked_columns(columns: str | None, run_column: str | None) -> dict[str, st
     if names.setdefault("experiment", run_column.strip()) != run_column.strip():
         raise typer.BadParameter("--columns and --run-column name different columns for experiment; leave one out.")
     return names
+
+
+def parsed_fit(texts: Sequence[str], simulation: str | None) -> tuple[str, ...]:
+    """Return the patterns of the numbers to fit, from ``--fit``.
+
+    Raises:
+        typer.BadParameter: the simulation is no model of MuJoCo, or a part is empty.
+
+    Example:
+        >>> parsed_fit(["joint:*.damping,actuator:*.kp"], "arm.xml")
+        ('joint:*.damping', 'actuator:*.kp')
+    """
+    parts = tuple(part.strip() for text in texts for part in text.split(","))
+    if parts and not is_model_of_mujoco(simulation or ""):
+        raise typer.BadParameter("--fit applies to a model of MuJoCo, MODEL.xml or MODEL.urdf; leave it out.")
+    if not all(parts):
+        raise typer.BadParameter("--fit has an empty part; write --fit joint:*.damping,actuator:*.kp.")
+    return parts
 
 
 def checked_units(conversions: list[str], label: str | None, simulation: str | None) -> dict[str, str]:

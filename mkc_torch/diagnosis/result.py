@@ -137,6 +137,10 @@ class CorrectingModel(nn.Module):
     def to_python(self, module: str | None = None, folder: Path | None = None) -> str:
         """Return the simulation with the findings as Python source."""
 
+    @abstractmethod
+    def to_mjcf(self) -> tuple[str, tuple[str, ...]]:
+        """Return a MuJoCo model's file with the findings, and the findings that it cannot express."""
+
 
 VERDICT_SENTENCES: dict[Verdict, str] = {
     "unfit": "The simulation does not fit the recording.",

@@ -9,12 +9,14 @@ from mkc_torch.simulation.parameter import Parameter, SimulationError
 from mkc_torch.simulation.ports import Port
 from mkc_torch.simulation.protocol import Correction, PreparedSimulation, Simulation
 from mkc_torch.simulation.static import Static
+from mkc_torch.simulation.stepped import MjcfError, Stepper, load_mjcf, mjcf_class
 
 __all__ = [
     "Correction",
     "Dynamics",
     "FmuError",
     "Magnetometer",
+    "MjcfError",
     "Paired",
     "Parameter",
     "Port",
@@ -23,8 +25,11 @@ __all__ = [
     "SimulationError",
     "SimulationFileError",
     "Static",
+    "Stepper",
     "base_class",
     "fmu_class",
     "load_fmu",
+    "load_mjcf",
     "load_simulation",
+    "mjcf_class",
 ]

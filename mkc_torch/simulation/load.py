@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mkc_torch.simulation.fmu import load_fmu
+from mkc_torch.simulation.stepped.mujoco.stepper import load_mjcf
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -27,18 +28,23 @@ class SimulationFileError(ValueError):
     """A simulation file that cannot be used; the message states why, with the user's part of a traceback."""
 
 
-def load_simulation(source: str) -> Simulation:
+def load_simulation(source: str, fitted: Sequence[str] = ()) -> Simulation:
     """Load the simulation ``FILE.py:NAME``: a class, which is called without arguments, or an instance.
 
     ``FILE.py`` is its only simulation.
 
     The file is run like a script: it can import modules from its folder and from the current folder. ``MODEL.fmu`` is
-    the simulation in an FMU, whose binary is run.
+    the simulation in an FMU, whose binary is run. ``MODEL.xml`` and ``MODEL.urdf`` are models of MuJoCo.
+
+    Args:
+        source: of the simulation.
+        fitted: for a model of MuJoCo, patterns of the numbers to fit; empty for those that the file gives.
 
     Raises:
         SimulationFileError: no such file or name, a file or class that raises, or an object that is not a simulation.
         FmuError: the FMU cannot be used.
-        ImportError: FMPy is not installed, which an FMU requires.
+        MjcfError: the model of MuJoCo cannot be used.
+        ImportError: FMPy or MuJoCo is not installed, which an FMU or a model of MuJoCo requires.
 
     Example:
         >>> load_simulation("nowhere.py:Pendulum")
@@ -47,6 +53,10 @@ def load_simulation(source: str) -> Simulation:
     """
     if _is_fmu(source):
         return load_fmu(source)
+    if is_mujoco_model(source):
+        return load_mjcf(source, fitted or None)
+    if fitted:
+        raise SimulationFileError(f"--fit applies to a model of MuJoCo, and {source} is none; leave it out.")
     path, name = _parts(source)
     if not path.is_file():
         raise SimulationFileError(f"{path}: there is no such file for --simulation {source}.")
@@ -124,7 +134,7 @@ def raised_in(source: str, error: BaseException) -> SimulationFileError | None:
     Example:
         >>> raised_in("my.py:Pendulum", ValueError("raised elsewhere"))
     """
-    if _is_fmu(source):
+    if _is_fmu(source) or is_mujoco_model(source):
         return None
     path, name = _parts(source)
     frames = traceback.extract_tb(error.__traceback__)
@@ -160,13 +170,24 @@ def _is_fmu(source: str) -> bool:
     return source.casefold().endswith(".fmu")
 
 
+def is_mujoco_model(source: str) -> bool:
+    """Whether a source is a model for MuJoCo, MJCF or URDF.
+
+    Example:
+        >>> is_mujoco_model("arm.xml"), is_mujoco_model("my.py:Pendulum")
+        (True, False)
+    """
+    return source.casefold().endswith((".xml", ".urdf", ".mjcf"))
+
+
 def _parts(source: str) -> tuple[Path, str]:
     if source.endswith(".py"):
         return Path(source), ""
     file, _, name = source.rpartition(":")
     if not file.endswith(".py") or not name:
         raise SimulationFileError(
-            f"{source}: this does not name a simulation; write FILE.py:NAME, as in my.py:Pendulum, or MODEL.fmu."
+            f"{source}: this does not name a simulation; write FILE.py:NAME, as in my.py:Pendulum, MODEL.fmu or "
+            "MODEL.xml."
         )
     return Path(file), name
 

@@ -24,6 +24,8 @@ class Parameter:
         lower, upper: bounds. Two finite bounds are also a Gaussian prior, with the mean and the standard deviation of a
             uniform distribution between them, in a fit of differential equations.
         unit: unit in reports.
+        uncertainty: standard deviation of a Gaussian prior about ``value``, in a fit of differential equations, in
+            place of the prior by the bounds; None for none.
 
     Raises:
         TypeError: a value or a bound is not a number, or the unit is not a string.
@@ -31,13 +33,14 @@ class Parameter:
 
     Example:
         >>> Parameter(0.1, lower=0.0, unit="1/s")
-        Parameter(value=0.1, lower=0.0, upper=inf, unit='1/s')
+        Parameter(value=0.1, lower=0.0, upper=inf, unit='1/s', uncertainty=None)
     """
 
     value: float
     lower: float = -torch.inf
     upper: float = torch.inf
     unit: str = ""
+    uncertainty: float | None = None
 
     def __post_init__(self) -> None:
         checked_number("value", self.value, -math.inf, math.inf, advice="it is what the fit starts from")
@@ -52,6 +55,8 @@ class Parameter:
                 f"Expected argument `value` to lie in [{self.lower}, {self.upper}], its own bounds, but got "
                 f"{self.value}; start within them, or widen them."
             )
+        if self.uncertainty is not None:
+            checked_number("uncertainty", self.uncertainty, 0.0, math.inf, advice="it is a standard deviation")
         refuse_other_type("unit", self.unit, str, "text", "write '1/s' say")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -13,6 +14,7 @@ from mkc_torch.recording import write_table
 
 # these tests import the simulated sensors only here
 from mkc_torch.recording.demonstration import concealed_recording, simulated_recording
+from tests.docs.pages import ROOT, blocks
 from tests.simulation.fmu.made import COMPILER, PENDULUM, make_fmu
 
 DRAG = 0.35
@@ -46,6 +48,31 @@ def write_examples(folder: Path) -> None:
         write_table(folder / f"{name}.csv", columns)
     if COMPILER is not None:
         make_fmu(folder / "pendulum.fmu", PENDULUM)
+    if find_spec("mujoco") is not None:
+        write_swing(folder)
+
+
+def write_swing(folder: Path, samples: int = 250, friction: float = 0.06) -> None:
+    """Write the manual's model for MuJoCo, and a recording of the same model with dry friction at its joint."""
+    import mujoco
+
+    text = next(block.text for block in blocks(ROOT / "docs" / "mujoco.md") if block.language == "xml")
+    (folder / "swing.xml").write_text(text, encoding="utf-8")
+    spec = mujoco.MjSpec.from_string(text)
+    spec.joints[0].frictionloss = friction
+    spec.option.timestep = 0.002
+    model = spec.compile()
+    data, draw = mujoco.MjData(model), torch.Generator().manual_seed(0)
+    drive = 0.5 * torch.randn(samples // 25, generator=draw, dtype=torch.float64).repeat_interleave(25)
+    angles = []
+    for command in drive.tolist():
+        angles.append(float(data.qpos[0]))
+        data.ctrl[0] = command
+        for _ in range(10):
+            mujoco.mj_step(model, data)
+    hinge = torch.tensor(angles, dtype=torch.float64) + 0.002 * torch.randn(samples, generator=draw)
+    time = 0.02 * torch.arange(samples, dtype=torch.float64)
+    write_table(folder / "SWING.csv", {"time": time, "drive": drive, "hinge": hinge})
 
 
 def vehicle_recording(samples: int = 1500, rate: float = 25.0) -> dict[str, Tensor]:

@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"
 PAGES = (README, *sorted((ROOT / "docs").glob("*.md")))
 
-RUN, SHOWN = frozenset({"python", "sh"}), frozenset({"text", "json"})
+RUN, SHOWN = frozenset({"python", "sh"}), frozenset({"text", "json", "xml"})
 """Languages of blocks that the tests run, and of blocks that show an output."""
 
 

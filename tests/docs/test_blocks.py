@@ -28,7 +28,7 @@ EXPECTED_FINDINGS = {
 }
 """First findings of the diagnoses of a page, by the name of the diagnosis in the page."""
 
-PACKAGES_OF_PAGES = {"large_data": "pyarrow", "own_simulation": "fmpy"}
+PACKAGES_OF_PAGES = {"large_data": "pyarrow", "own_simulation": "fmpy", "mujoco": "mujoco"}
 """Packages that a page needs in addition to those of all pages."""
 
 OPTIONAL = [block for page in PAGES for block in blocks(page) if block.needs is not None]

@@ -32,6 +32,7 @@ MANUAL = {
     "loss.md",
     "losses.md",
     "measured.md",
+    "mujoco.md",
     "own_simulation.md",
     "promises.md",
     "ros.md",

@@ -81,11 +81,9 @@ def process_noise_of(prepared: PreparedDynamics, noise: StateSpaceNoise) -> tupl
     found = noise.selected
     sentences = []
     for disturbance, error, gain in zip(found.disturbances, found.errors, found.gains, strict=True):
-        unit = (
-            prepared.ports[f"rate of {disturbance.place}"].unit
-            if disturbance.at_rate
-            else _unit_of(prepared, disturbance.place)
-        )
+        unit = _unit_of(prepared, disturbance.place)
+        if disturbance.at_rate:
+            unit = f"{unit}/s" if unit else "1/s"
         of_size = disturbance.size * error if math.isfinite(error) else disturbance.size
         sentences.append(
             ProcessNoise(

@@ -13,8 +13,10 @@ import torch
 from torch import Tensor, nn
 
 from mkc_torch.diagnosis.declared import checked_input_hold
+from mkc_torch.diagnosis.io.mjcf import mjcf_source
 from mkc_torch.diagnosis.io.python_source import SourceError, python_source
 from mkc_torch.diagnosis.io.selected_sizes import refuse_unselected, selected, without_runs
+from mkc_torch.diagnosis.io.term_entry import term_entry
 from mkc_torch.diagnosis.io.training import Training
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.joint import in_order_of_the_chain, summed
@@ -23,7 +25,7 @@ from mkc_torch.diagnosis.result import CorrectingModel
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context
-from mkc_torch.effects.per_recording import PerRecording, is_relative
+from mkc_torch.effects.per_recording import PerRecording
 from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
 from mkc_torch.recording.recording import MissingColumnError, Recording
 from mkc_torch.simulation.dynamics import Dynamics
@@ -31,6 +33,7 @@ from mkc_torch.simulation.magnetometer import Magnetometer
 from mkc_torch.simulation.paired import Paired
 from mkc_torch.simulation.ports import Change, Changes
 from mkc_torch.simulation.protocol import CorrectableSimulation, Correction, PreparedSimulation, Simulation
+from mkc_torch.simulation.stepped.mujoco import MujocoStepper
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -197,23 +200,7 @@ class DiagnosedModel(CorrectingModel):
 
     def to_json(self) -> str:
         """Return the model as JSON of the schema "mkc-model/1"; numbers round-trip exactly."""
-        terms = [
-            {
-                "effect": term.effect.id,
-                "drivers": [
-                    {"column": column, "reference": float(reference), "unit": unit}
-                    for column, reference, unit in zip(*_columns(term), strict=True)
-                ],
-                "shape": dict(term.shape),
-                **({"port": term.at} if term.at else {}),
-                **({"first": True} if term.first else {}),
-                **({"recordings": list(term.effect.recordings)} if term.effect.recordings else {}),
-                **({"relative": True} if is_relative(term.effect) else {}),
-                "parameters": gamma.tolist(),
-                "equation": term.effect.equation,
-            }
-            for term, gamma in zip(self.terms, self.gammas, strict=True)
-        ]
+        terms = [term_entry(term, gamma) for term, gamma in zip(self.terms, self.gammas, strict=True)]
         content = {
             "schema": SCHEMA,
             "simulation": self.simulation,
@@ -248,6 +235,16 @@ class DiagnosedModel(CorrectingModel):
         return python_source(
             system, self.theta.tolist(), self.terms, tuple(self.gammas), measured, holds, module, folder
         )
+
+    def to_mjcf(self) -> tuple[str, tuple[str, ...]]:
+        """Return a MuJoCo model's file with the fitted numbers and findings, and the findings that it cannot express.
+
+        Raises:
+            SourceError: the simulation is no MuJoCo model.
+        """
+        if not isinstance(self.source, MujocoStepper):
+            raise SourceError(f'Only a MuJoCo model can be exported as MJCF, but the model is of "{self.simulation}".')
+        return mjcf_source(self.source, self.theta.tolist(), self.terms, tuple(self.gammas))
 
     @staticmethod
     def from_json(
@@ -307,12 +304,6 @@ def own_parameters(prepared: PreparedSimulation, parameters: Float[Tensor, " p"]
     """Return the simulation's parameters and initial states, without the offsets of single recordings."""
     of_recordings = {offset.name for offset in prepared.own_offsets}
     return parameters[[k for k, name in enumerate(prepared.parameter_names) if name not in of_recordings]]
-
-
-def _columns(term: Term) -> tuple[Sequence[str], Sequence[float], Sequence[str]]:
-    if term.driver is None:
-        return (), (), ()
-    return term.driver.columns, term.driver.reference.tolist(), term.driver.units
 
 
 def _read(content: Mapping[str, Any], known: Sequence[Effect], simulation: Simulation | None) -> DiagnosedModel:

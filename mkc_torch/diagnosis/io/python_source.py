@@ -19,6 +19,7 @@ from mkc_torch.simulation.dynamics.user_functions import kinematic
 from mkc_torch.simulation.fmu import is_of_an_fmu
 from mkc_torch.simulation.load import file_of
 from mkc_torch.simulation.parameter import Parameter, known_parameters
+from mkc_torch.simulation.stepped.mujoco.stepper import is_of_a_model
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -131,7 +132,8 @@ def _alone(kind: type) -> str:
 
 
 def _of_class(line: str | None) -> str:
-    return f"from mkc_torch.simulation import {'fmu_class' if ' = fmu_class(' in (line or '') else 'base_class'}"
+    name = next((name for name in ("fmu_class", "mjcf_class") if f" = {name}(" in (line or "")), "base_class")
+    return f"from mkc_torch.simulation import {name}"
 
 
 def _loaded(kind: type, folder: Path | None) -> str | None:
@@ -139,16 +141,22 @@ def _loaded(kind: type, folder: Path | None) -> str | None:
 
     With a relative path, both files can be moved together.
     """
-    fmu = kind.evaluation.description.path if is_of_an_fmu(kind) else None
-    file = fmu or file_of(kind)
-    if file is None or (folder is None and fmu is None):
+    file: Path | None
+    if is_of_an_fmu(kind):
+        of_a_model, file = "fmu_class", kind.evaluation.description.path
+    elif is_of_a_model(kind):
+        of_a_model, file = "mjcf_class", kind.description.path
+    else:
+        of_a_model, file = "", file_of(kind)
+    if file is None or (folder is None and not of_a_model):
         return None
     try:
         way = Path(file.name if folder is None else os.path.relpath(file.resolve(), folder.resolve())).as_posix()
     except ValueError:  # on another drive
         return None
-    if fmu is not None:
-        return f"{kind.__name__} = fmu_class({json.dumps(way, ensure_ascii=False)}, __file__)"
+    if of_a_model:
+        fitted = f", fitted={kind.description.fitted!r}" if is_of_a_model(kind) and kind.description.fitted else ""
+        return f"{kind.__name__} = {of_a_model}({json.dumps(way, ensure_ascii=False)}, __file__{fitted})"
     return f"{kind.__name__} = base_class({json.dumps(f'{way}:{kind.__name__}', ensure_ascii=False)}, __file__)"
 
 

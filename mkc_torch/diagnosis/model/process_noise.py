@@ -141,7 +141,8 @@ def fit_alone(
             return fit_with_process_noise(_wider(fitted(model, starts[0]), settings), declared, settings, model=model)
         except NoFitError as error:
             raise NoFitError(no_first_fit(prepared)) from error
-    short = multiple_shooting_start(system, system.given)
+    # the numbers of a simulation that steps are near, by their prior, and its steps are dear
+    short = None if system.system.steps is not None else multiple_shooting_start(system, system.given)
     starts += [] if short is None else [short]
     free = _best_open_loop(model, starts)
     if free is not None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from mkc_torch.recording.formats.base import FileFormat, RecordingError, Table, Topic, polars
 from mkc_torch.recording.formats.damage import quiet_terminal
+from mkc_torch.recording.formats.lerobot import is_of_lerobot, joints_and_commands
 from mkc_torch.recording.formats.magic_numbers import begins_with, wrong_format_error
 from mkc_torch.recording.formats.sandbox import broken, reads_without_crash
 
@@ -38,6 +39,8 @@ def read(path: Path) -> Table:
         raise broken(path, "Parquet file") from error
     if not len(frame):
         raise RecordingError(f"{path}: the table has no rows.")
+    if is_of_lerobot(frame):
+        frame = joints_and_commands(path, frame)
     return Table([name.strip() for name in frame.columns], frame.get_columns(), range(1, len(frame) + 1), "row")
 
 

@@ -13,6 +13,7 @@ from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.correction import DynamicsCorrection
 from mkc_torch.simulation.dynamics.missing import usable_rows
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+from mkc_torch.simulation.dynamics.steps import Steps
 from mkc_torch.simulation.dynamics.user_functions import check_names
 from mkc_torch.simulation.own_offsets import OwnOffset
 from mkc_torch.simulation.parameter import Parameter, SimulationError
@@ -76,6 +77,8 @@ class Dynamics:
     starts_as: Mapping[str, str] = {}
     joins_experiments: bool = True
     own_offsets: tuple[OwnOffset, ...] = ()
+    steps: Steps | None = None
+    saved: Mapping[str, object] = {}
     measured: frozenset[str] = frozenset()
 
     def derivative(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor] | Sequence[Tensor]:

@@ -96,6 +96,8 @@ def entries(system: Equations, known: Mapping[str, Parameter], kinematic: Mappin
         >>> entries(Cart(), {}, {"x": "v", "angle": "w"})
         {'force': 'v'}
     """
+    if system.steps is not None:
+        return dict(system.steps.forces)
     gains = _gains(system, known)
     speeds = [state for state in system.states if state in kinematic.values()]
     choices: dict[str, list[str]] = {}
@@ -145,6 +147,8 @@ def lone_input(prepared: Known, state: str) -> str | None:
         None without such an input.
     """
     system = prepared.system
+    if system.steps is not None:
+        return None
     gains = _gains(system, prepared.known)
     moving = [name for name in system.inputs if _moves(gains, state, name)]
     if len(moving) != 1 or any(_moves(gains, other, moving[0]) for other in system.states if other != state):

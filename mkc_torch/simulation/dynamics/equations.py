@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
+from mkc_torch.simulation.dynamics.steps import Steps
 from mkc_torch.simulation.own_offsets import OwnOffset
 from mkc_torch.simulation.parameter import Parameter
 
@@ -19,6 +20,8 @@ class Equations(Protocol):
         states, inputs, outputs, parameters, initial, units, input_hold, restart_after, step, initial_window, starts_as:
             see :class:`mkc_torch.simulation.Dynamics`.
         own_offsets: offsets of outputs in single recordings, the last parameters.
+        saved: entries that ``model.json`` keeps to make the same simulation again.
+        steps: the map of a simulation that steps; None for differential equations.
     """
 
     @property
@@ -47,6 +50,10 @@ class Equations(Protocol):
     def starts_as(self) -> Mapping[str, str]: ...
     @property
     def own_offsets(self) -> tuple[OwnOffset, ...]: ...
+    @property
+    def saved(self) -> Mapping[str, object]: ...
+    @property
+    def steps(self) -> Steps | None: ...
 
     def derivative(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor] | Sequence[Tensor]: ...
     def output(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor]: ...

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.nonlinear import NoFitError, fit
-from mkc_torch.simulation.dynamics.trajectory import defect
+from mkc_torch.simulation.dynamics.trajectory import Grid, defect
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -26,7 +26,7 @@ def first_parameters(
     own: int,
     rate: Callable[[Float[Tensor, " p"]], Callable[[Tensor], Tensor]],
     guess: Float[Tensor, "G n"],
-    step: Float[Tensor, "G-1 1"],
+    grid: Grid,
     residual: Callable[[Float[Tensor, " p"]], Float[Tensor, "N m"]],
 ) -> Float[Tensor, " p"]:
     """The user's values, or those that minimise the defects of the guessed states, whichever has the smaller residual.
@@ -37,7 +37,7 @@ def first_parameters(
         own: number of parameters before the initial states.
         rate: from the parameters to the function for the states' rates of change.
         guess: (G, n), of the states at all grid times.
-        step: (G-1, 1), length of each interval in s.
+        grid: the G grid times.
         residual: recording minus simulation, (N, m), by the parameters.
     """
     starts = [given]
@@ -46,7 +46,7 @@ def first_parameters(
         typical = guess.abs().median(0).values.clamp(min=1e-12)
 
         def summed_defects(values: Tensor) -> Tensor:
-            left = defect(rate(torch.cat([values, begin])), guess, step) / typical
+            left = defect(rate(torch.cat([values, begin])), guess, grid) / typical
             total = torch.cat([torch.zeros_like(left[:1]), left.cumsum(0)])
             return total[_WINDOW:] - total[:-_WINDOW]
 

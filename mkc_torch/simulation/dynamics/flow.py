@@ -80,7 +80,7 @@ def flow_along(
     step = prepared.grid.step
     rate, jump = prepared.rate(theta, changes), prepared.jump(theta, changes)
     # only the system's own states are linearised; those of effects and disturbances are held fixed
-    A, _ = transition_matrices(rate, states, step.unsqueeze(-1), jump)
+    A, _ = transition_matrices(rate, states, prepared.grid, jump)
     A = A[:, :n, :n].detach()
     places = [prepared.system.states.index(name) for name in prepared.disturbable]
     unit = torch.eye(n, dtype=states.dtype)[:, places]

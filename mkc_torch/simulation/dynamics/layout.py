@@ -74,8 +74,14 @@ class Layout:
     share: Float[Tensor, " G"]
 
 
-def lay_out(known: InputRows, parts: int) -> Layout:
+def lay_out(known: InputRows, parts: int, map_step: float | None = None) -> Layout:
     """Divide each interval between rows with inputs into a number of equal parts.
+
+    Args:
+        known: the rows.
+        parts: number of parts.
+        map_step: for a simulation that steps, the length of its step in s: the parts of an interval are the nearest
+            number of steps, at least one.
 
     Example:
         Outputs at the first and the last of three rows:
@@ -88,7 +94,11 @@ def lay_out(known: InputRows, parts: int) -> Layout:
     """
     R = len(known.time)
     inside = ~known.begins[1:]
-    count = torch.where(inside, parts, 1)
+    if map_step is not None:
+        within = (known.time.diff() / map_step).round().clamp(min=1).long()
+    else:
+        within = torch.full((R - 1,), parts)
+    count = torch.where(inside, within, 1)
     before = torch.arange(R - 1).repeat_interleave(count)
     part = torch.arange(len(before)) - (count.cumsum(0) - count).repeat_interleave(count)
     step = 1.0 / count.repeat_interleave(count).double()
@@ -101,10 +111,17 @@ def lay_out(known: InputRows, parts: int) -> Layout:
     time = torch.cat([at[::3], at[-1:]])
     begins = torch.zeros(len(time), dtype=torch.bool)
     begins[first[known.begins]] = True
-    input_clock = SignalTimes(at, early, early + 1, share)
-    clock = input_clock if len(known.samples) == R else _among_samples(known, input_clock)
+
+    def clocks(at: Tensor, share: Tensor) -> tuple[SignalTimes, SignalTimes]:
+        among_rows = SignalTimes(at, early, early + 1, share)
+        return among_rows, among_rows if len(known.samples) == R else _among_samples(known, among_rows)
+
+    clock = clocks(at, share)[1]
     nodes = torch.cat([clock.before[::3], clock.before[-1:]]), torch.cat([clock.share[::3], clock.share[-1:]])
-    return Layout(Grid(time, begins), first[known.samples], input_clock, clock, *nodes)
+    if map_step is not None:
+        at, share = at[::3].repeat_interleave(3), share[::3].repeat_interleave(3)
+    grid, found = Grid(time, begins, map_step), clocks(at, share)
+    return Layout(grid, first[known.samples], *found, *nodes)
 
 
 def _among_samples(known: InputRows, clock: SignalTimes) -> SignalTimes:

@@ -73,9 +73,9 @@ class PortContext:
         """
         system = self.system
         places = {}
-        for state in system.states:
-            if state in self.kinematic:
-                continue
+        forces = {} if system.steps is None else system.steps.forces
+        free = [state for state in system.states if state not in self.kinematic and state not in forces.values()]
+        for state in free:
             parts = self._parts(state)
             rate = {"rate": f"rate of {state}"} if "position" in parts else {}
             places[f"rate of {state}"] = self._rate_port(state, "rate", {**parts, **rate})
@@ -85,9 +85,7 @@ class PortContext:
                 port = self._rate_port(state, kind, parts)
                 places[f"{kind} of {state}"] = replace(port, memory=memory_at(kind, state))
         pairs = [
-            (first, second)
-            for first, second in combinations((s for s in system.states if s not in self.kinematic), 2)
-            if self._unit_of(first) == self._unit_of(second)
+            (first, second) for first, second in combinations(free, 2) if self._unit_of(first) == self._unit_of(second)
         ]
         for first, second in pairs:
             sideways = {"sideways": second} if self._is_way(first) and self._is_way(second) else {}
@@ -95,7 +93,7 @@ class PortContext:
             levels = {"level": first, "other level": second} if both else {}
             port = self._rate_port(first, "exchange", {"own": first, "other": second, **sideways, **levels})
             places[f"exchange of {first} and {second}"] = replace(port, channels=(first, second))
-        for name in system.inputs:
+        for name in (name for name in system.inputs if name not in forces):
             actuator = {} if name in self._surroundings.values() else {"actuator": name}
             places[f"input {name}"] = Port(
                 (name,),

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mkc_torch._support.dual_constants import dual_constants
 from mkc_torch._support.torch_internals import is_wrapped
-from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
+from mkc_torch.nonlinear import load_forward_mode
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.continuation import Meaning, is_plain
 from mkc_torch.simulation.dynamics.between_samples import inputs_between
@@ -29,7 +29,9 @@ from mkc_torch.simulation.dynamics.missing import MissingOutputs, with_lines
 from mkc_torch.simulation.dynamics.observer import Observer
 from mkc_torch.simulation.dynamics.own_offsets import equations_with_offsets
 from mkc_torch.simulation.dynamics.ports import ENTRY, RATES, PortContext, common_unit
+from mkc_torch.simulation.dynamics.prior import prior_of
 from mkc_torch.simulation.dynamics.refinement import FINEST, enough_parts
+from mkc_torch.simulation.dynamics.rollout import rolled_out, rolls_out
 from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
 from mkc_torch.simulation.dynamics.settings import HORIZON
 from mkc_torch.simulation.dynamics.single_outputs import with_changes
@@ -76,7 +78,8 @@ class PreparedDynamics(CheckedDynamics):
         self.run = experiment_runs(self.recording)
         self.known_inputs = InputRows.of(recording, system.inputs, sampled, self.begins)
         self.inputs_at_rows = self.known_inputs.inputs[self.known_inputs.samples]
-        self.input_hold = dict.fromkeys(system.inputs, system.input_hold)
+        # a simulation that steps holds its inputs over each step; there is no choice
+        self.input_hold = dict.fromkeys(system.inputs, system.input_hold) if system.steps is None else {}
         refuse_few(self.begins, system.name)
         self.kinematic = kinematic(system, self.known)
         self._lay_out(1)
@@ -86,7 +89,7 @@ class PreparedDynamics(CheckedDynamics):
         high = [parameter.upper for parameter in self.known.values()]
         any_value = [torch.inf] * len(starts)
         self.bounds = self.time.new_tensor([*low, *(-x for x in any_value)]), self.time.new_tensor(high + any_value)
-        self.prior = _prior_within(*self.bounds)
+        self.prior = prior_of(list(self.known.values()), len(starts))
         self.clean = torch.stack([despiked(self.recording[name], self.time, self.begins) for name in outputs], -1)
         self.counts = self.clean == self.measured
         if self.missing is not None:
@@ -97,7 +100,8 @@ class PreparedDynamics(CheckedDynamics):
 
     def _lay_out(self, parts: int) -> None:
         """Set up the grid with this many intervals between rows, and everything that depends on the grid."""
-        found, self.parts = lay_out(self.known_inputs, parts), parts
+        size = None if self.system.steps is None else self.system.steps.size
+        found, self.parts = lay_out(self.known_inputs, parts, size), parts
         self.grid, self.rows, self.clock, self._input_clock = found.grid, found.rows, found.clock, found.input_clock
         self.inputs = self._between(self.known_inputs.inputs)
         self.guess = first_guess(
@@ -115,9 +119,10 @@ class PreparedDynamics(CheckedDynamics):
     def _between(self, inputs: Float[Tensor, "R u"]) -> Float[Tensor, "S u"]:
         """Inputs at the stations."""
         known = self.known_inputs
+        holds = dict.fromkeys(self.system.inputs, self.system.input_hold) | self.input_hold
         columns = [
             inputs_between(inputs[:, [k]], how, known.time, known.begins, self._input_clock)
-            for k, how in enumerate(self.input_hold.values())
+            for k, how in enumerate(holds.values())
         ]
         return torch.cat(columns, -1) if columns else inputs.new_zeros(len(self.clock.time), 0)
 
@@ -127,7 +132,7 @@ class PreparedDynamics(CheckedDynamics):
         holds = {"input_hold": dict(self.input_hold)} if self.input_hold else {}
         seconds = self.system.restart_after
         restarts = {} if seconds is None else {"restart_after": seconds}
-        return {"class": self.system.name, "outputs": list(self.channels), **holds, **restarts}
+        return {"class": self.system.name, "outputs": list(self.channels), **self.system.saved, **holds, **restarts}
 
     def with_input_hold(self, between: Mapping[str, str]) -> PreparedDynamics:
         """The simulation with other input interpolation, "held", "linear" or "smooth", by input name."""
@@ -140,7 +145,7 @@ class PreparedDynamics(CheckedDynamics):
 
     def finer(self) -> PreparedDynamics | None:
         """The simulation with half the integration step; None where the user set the step, or it is the smallest."""
-        if self.system.step is not None or 2 * self.parts > FINEST:
+        if self.system.step is not None or self.system.steps is not None or 2 * self.parts > FINEST:
             return None
         other = copy.copy(self)
         other._lay_out(2 * self.parts)
@@ -206,8 +211,8 @@ class PreparedDynamics(CheckedDynamics):
         def rate(theta: Tensor) -> Callable[[Tensor], Tensor]:
             return self.rate(theta, {})
 
-        residual, step = partial(self.residual, changes={}), self.grid.step.unsqueeze(-1)
-        return first_parameters(self.given, self.bounds, len(self.known), rate, self.guess, step, residual)
+        residual = partial(self.residual, changes={})
+        return first_parameters(self.given, self.bounds, len(self.known), rate, self.guess, self.grid, residual)
 
     def answer(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Answer:
         """The residual and the trajectory; see :meth:`mkc_torch.simulation.PreparedSimulation.answer`."""
@@ -271,7 +276,7 @@ class PreparedDynamics(CheckedDynamics):
         found = self.trajectory(theta, changes, near)
         acting = self.acting(theta, changes)
         jump = self.jump(theta, changes)
-        at_stations = stations(self.rate(theta, changes, acting), found.states, self.grid.step.unsqueeze(-1), jump)
+        at_stations = stations(self.rate(theta, changes, acting), found.states, self.grid, jump)
         at_stations = at_stations[:, : len(self.system.states)]
         here, at_samples = self.acting_at_samples(theta, changes), found.states[self.rows]
         outputs, plain = self._outputs(here, changes, at_samples), self.predicted(here, {})(at_samples)
@@ -303,10 +308,17 @@ class PreparedDynamics(CheckedDynamics):
         rate, jump = self.rate(theta, changes), self.jump(theta, changes)
         begin, memories = self.first_states(theta, changes)
         width = begin.shape[1]
+        if rolls_out(self, theta, changes):
+            found = rolled_out(self, rate, theta, changes, begin)
+            if found.converged:
+                return found
         known = near if isinstance(near, Trajectory) else None
         guess = self.with_memories(self.guess if known is None else known.states, memories)
         linear = known is not None and known.linear is not None and known.states.shape[1] == width
         found = solve(rate, self.grid, begin, guess, known if linear else None, jump=jump)
+        if not found.converged and self.system.steps is not None and jump is None:
+            # a fit shortens its step where this fails; step by step would be dear
+            return rolled_out(self, rate, theta, changes, begin) if known is None and is_plain(theta) else found
         if not found.converged and known is not None:
             found = solve(rate, self.grid, begin, self.with_memories(self.guess, memories), jump=jump)
         if not found.converged and known is None:
@@ -418,6 +430,8 @@ class PreparedDynamics(CheckedDynamics):
 
     def _refine(self) -> None:
         """Set the number of intervals between samples: by the user's step, or until doubling changes nothing."""
+        if self.system.steps is not None:
+            return
         if self.system.step is not None:
             inside = self.known_inputs.time.diff()[~self.known_inputs.begins[1:]]
             self._lay_out(max(1, int(torch.ceil(inside.max() / self.system.step - 1e-9))))
@@ -430,16 +444,3 @@ class PreparedDynamics(CheckedDynamics):
             return self.simulated(theta, {})
 
         self._lay_out(enough_parts(simulated, self.measured))
-
-
-def _prior_within(lower: Float[Tensor, " p"], upper: Float[Tensor, " p"]) -> GaussianPrior | None:
-    """Return the mean and precision of a uniform distribution within two finite limits; None if no parameter has two.
-
-    At a limit of the gravity, for example, missing drag would be estimated too large.
-    """
-    limited = lower.isfinite() & upper.isfinite() & (upper > lower)
-    if not bool(limited.any()):
-        return None
-    none = torch.zeros_like(lower)
-    mean = torch.where(limited, 0.5 * (lower + upper), none)
-    return GaussianPrior(mean, torch.where(limited, 12.0 / (upper - lower).square(), none))

@@ -17,6 +17,9 @@ HALVINGS = 6
 QUICK = 0.01
 """Largest remaining share of the defects after a step with the linearisation of a trajectory nearby."""
 
+QUICK_MAP = 0.3
+"""The same for a simulation that steps, whose derivatives are differences of many steps."""
+
 ROUNDING = 1e-6
 """Change, as a share of each state's size, below which defects that no longer shrink are rounding errors."""
 

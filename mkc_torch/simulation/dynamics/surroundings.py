@@ -41,6 +41,8 @@ def surroundings(system: Equations) -> dict[str, str]:
         >>> surroundings(Heater())
         {'temp': 'outside'}
     """
+    if system.steps is not None:
+        return {}  # forces act on its speeds alone
     known = known_parameters(system.name, system.parameters)
     found = {}
     for state in system.states:

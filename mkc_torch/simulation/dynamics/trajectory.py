@@ -26,6 +26,7 @@ from mkc_torch.simulation.dynamics.settings import (
     HORIZON,
     MOST_STEPS,
     QUICK,
+    QUICK_MAP,
     ROUGHLY,
     ROUNDING,
     SETTLED,
@@ -52,15 +53,20 @@ class Grid:
     Attributes:
         time: (G,), in s.
         begins: (G,), True where a trajectory starts, and for the first time.
+        map_step: for a simulation that steps, the length of its step in s, whatever the times of the grid: the states
+            follow the map ``x + map_step rate(x)``, and all stations of an interval are at its left end. None for a
+            differential equation.
     """
 
     time: Float[Tensor, " G"]
     begins: Bool[Tensor, " G"]
+    map_step: float | None = None
 
     @property
     def step(self) -> Float[Tensor, " G-1"]:
         """Length of each interval in s; 0 before the start of a trajectory."""
-        return torch.where(self.begins[1:], 0.0, self.time.diff())
+        inside = self.time.diff() if self.map_step is None else torch.full_like(self.time[1:], self.map_step)
+        return torch.where(self.begins[1:], 0.0, inside)
 
     @property
     def stations(self) -> Float[Tensor, " 3G-3"]:
@@ -70,6 +76,8 @@ class Grid:
     def spread(self, values: Float[Tensor, G * rest]) -> Float[Tensor, "3G-3 *rest"]:
         """Interpolate values at the grid times to the stations linearly."""
         left, right = values[:-1], values[1:]
+        if self.map_step is not None:
+            return left.repeat_interleave(3, 0)
         return torch.stack([left, 0.5 * (left + right), right], 1).flatten(0, 1)
 
     @property
@@ -168,14 +176,13 @@ def solve(
         >>> bool((found.states[:, 0] - torch.exp(-2.0 * time)).abs().max() < 2e-6), found.converged
         (True, True)
     """
-    step = grid.step.unsqueeze(-1)
     origin = grid.begins.unsqueeze(-1)
     places = grid.begins.long().cumsum(0) - 1
     states = torch.where(origin, begin.detach()[places], (guess if known is None else known.states).detach())
-    at = _Point.of(rate, states, step, jump)
+    at = _Point.of(rate, states, grid, jump)
     linear = None if known is None else known.linear
     fresh, moved_on = linear is None, False
-    recurrence = _recurrence(rate, states, step, grid, jump) if linear is None else linear.recurrence
+    recurrence = _recurrence(rate, states, grid, jump) if linear is None else linear.recurrence
     converged = False
     settled = max(SETTLED, _DIGITS * torch.finfo(states.dtype).eps)
     norms = [at.norm]
@@ -188,12 +195,12 @@ def solve(
         after, part = at, 1.0
         if size < torch.inf:
             for _ in range(HALVINGS if fresh else 1):
-                after = _Point.of(rate, at.states + part * change, step, jump)
+                after = _Point.of(rate, at.states + part * change, grid, jump)
                 if after.norm <= at.norm:
                     break
                 part *= 0.5
-        if not fresh and not after.norm <= QUICK * at.norm:
-            recurrence, fresh = _recurrence(rate, at.states, step, grid, jump), True
+        if not fresh and not after.norm <= (QUICK if grid.map_step is None else QUICK_MAP) * at.norm:
+            recurrence, fresh = _recurrence(rate, at.states, grid, jump), True
             continue
         if after is at or (not after.norm < at.norm and size * part > ROUNDING):
             break
@@ -207,7 +214,7 @@ def solve(
     def renewed() -> Recurrence:
         # these tensors belong to no transform of the caller, within which this would nest forward mode
         with nullcontext() if transformed else temporarily_clear_interpreter_stack():
-            return _recurrence(rate, states, step, grid, jump)
+            return _recurrence(rate, states, grid, jump)
 
     if transformed or any(tensor.requires_grad for tensor in (left, begin)):
         # outside of the transform the result is the same, and cheaper
@@ -235,7 +242,7 @@ def linearised_later(
     def renewed() -> Recurrence:
         with temporarily_clear_interpreter_stack():
             rate, jump = functions()
-            return _recurrence(rate, states, grid.step.unsqueeze(-1), grid, jump)
+            return _recurrence(rate, states, grid, jump)
 
     return Linear(renewed, factor=factor)
 
@@ -260,7 +267,6 @@ def marched(
     Returns:
         The states, (G, n), to a rough tolerance; None where the iteration diverges.
     """
-    step = grid.step.unsqueeze(-1)
     index = torch.arange(len(guess), device=guess.device)
     first = torch.where(grid.begins, index, 0).cummax(0).values
     place = index - first
@@ -270,17 +276,17 @@ def marched(
         states = states[torch.minimum(index, first + horizon - stride)]
         inside = (place <= horizon).unsqueeze(-1)
         for _ in range(MOST_STEPS):
-            at = _Point.of(rate, states, step, jump)
+            at = _Point.of(rate, states, grid, jump)
             left = torch.where(inside[1:], at.left.detach(), 0.0)
             change = torch.where(
-                inside, _recurrence(rate, states, step, grid, jump).solved(torch.zeros_like(states), left), 0.0
+                inside, _recurrence(rate, states, grid, jump).solved(torch.zeros_like(states), left), 0.0
             )
             size = float((change / at.scale).abs().max())
             if not size < torch.inf:
                 return None
             part, norm = 1.0, float((left / at.scale).square().mean())
             for _ in range(HALVINGS):
-                after = defect(rate, states + part * change, step, jump).detach()
+                after = defect(rate, states + part * change, grid, jump).detach()
                 if float((torch.where(inside[1:], after, 0.0) / at.scale).square().mean()) <= norm:
                     break
                 part *= 0.5
@@ -300,10 +306,10 @@ class _Point:
     norm: float
 
     @classmethod
-    def of(cls, rate: Rate, states: Tensor, step: Tensor, jump: Jump | None) -> _Point:
+    def of(cls, rate: Rate, states: Tensor, grid: Grid, jump: Jump | None) -> _Point:
         scale = states.abs().amax(0)
         scale = scale + 1e-6 * scale.max() + 1e-12
-        left = defect(rate, states, step, jump)
+        left = defect(rate, states, grid, jump)
         return cls(states, left, scale, float((left.detach() / scale).square().mean()))
 
 
@@ -316,24 +322,23 @@ def _joined(left: Tensor, middle: Tensor, right: Tensor) -> Tensor:
     return torch.stack([left, middle, right], 1).flatten(0, 1)
 
 
-def stations(
-    rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], jump: Jump | None = None
-) -> Float[Tensor, "3G-3 n"]:
+def stations(rate: Rate, states: Float[Tensor, "G n"], grid: Grid, jump: Jump | None = None) -> Float[Tensor, "3G-3 n"]:
     """States at the stations; the midpoint is on the cubic Hermite polynomial through the interval's ends."""
     left, right = _after(states, jump)[:-1], states[1:]
+    if grid.map_step is not None:
+        return left.repeat_interleave(3, 0)
     middle = 0.5 * (left + right)
     at_left, _, at_right = _ends(rate(_joined(left, middle, right)))
-    return _joined(left, middle + 0.125 * step * (at_left - at_right), right)
+    return _joined(left, middle + 0.125 * grid.step.unsqueeze(-1) * (at_left - at_right), right)
 
 
-def defect(
-    rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], jump: Jump | None = None
-) -> Float[Tensor, "G-1 n"]:
-    """Defect of Simpson's rule over each interval, (G-1, n); 0 before the start of a trajectory."""
-    at = stations(rate, states, step, jump)
+def defect(rate: Rate, states: Float[Tensor, "G n"], grid: Grid, jump: Jump | None = None) -> Float[Tensor, "G-1 n"]:
+    """Defect of Simpson's rule, or of the map, over each interval, (G-1, n); 0 before the start of a trajectory."""
+    step = grid.step.unsqueeze(-1)
+    at = stations(rate, states, grid, jump)
     left, middle, right = _ends(rate(at))
     gone = torch.where(step > 0, states[1:] - at[::3], 0.0)
-    return gone - step / 6.0 * (left + 4.0 * middle + right)
+    return gone - step * (left if grid.map_step is not None else (left + 4.0 * middle + right) / 6.0)
 
 
 def _after(states: Float[Tensor, "G n"], jump: Jump | None) -> Float[Tensor, "G n"]:
@@ -341,24 +346,24 @@ def _after(states: Float[Tensor, "G n"], jump: Jump | None) -> Float[Tensor, "G 
 
 
 def transition_matrices(
-    rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], jump: Jump | None = None
+    rate: Rate, states: Float[Tensor, "G n"], grid: Grid, jump: Jump | None = None
 ) -> tuple[Float[Tensor, "G-1 n n"], Float[Tensor, "G-1 n n"]]:
     """Derivatives of the next states by the states just after a grid time, and by the interval's negative defect."""
     n = states.shape[1]
     eye = torch.eye(n, dtype=states.dtype, device=states.device)
-    slope = slopes(rate, stations(rate, states, step, jump).detach())
+    slope = slopes(rate, stations(rate, states, grid, jump).detach())
     left, middle, right = _ends(slope)
-    h = step.unsqueeze(-1)
+    h = grid.step.unsqueeze(-1).unsqueeze(-1)
+    if grid.map_step is not None:
+        return torch.where(h > 0, eye + h * left, 0.0), eye.expand_as(left)
     behind = -eye - h / 6.0 * (left + 4.0 * middle @ (0.5 * eye + 0.125 * h * left))
     ahead = eye - h / 6.0 * (right + 4.0 * middle @ (0.5 * eye - 0.125 * h * right))
     inverse, _ = torch.linalg.inv_ex(ahead)
     return torch.where(h > 0, -inverse @ behind, 0.0), inverse
 
 
-def _recurrence(
-    rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], grid: Grid, jump: Jump | None
-) -> Recurrence:
-    carries, inverse = transition_matrices(rate, states, step, jump)
+def _recurrence(rate: Rate, states: Float[Tensor, "G n"], grid: Grid, jump: Jump | None) -> Recurrence:
+    carries, inverse = transition_matrices(rate, states, grid, jump)
     if jump is not None:
         carries = carries @ jump.slope(states.detach())[:-1]
     # no interval ends at the first grid time

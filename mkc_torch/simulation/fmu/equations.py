@@ -16,8 +16,9 @@ from mkc_torch.simulation.dynamics.missing import usable_rows
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.fmu.cosimulation import Simulated
 from mkc_torch.simulation.fmu.description import Description, FmuError, FmuVariable, read_description
-from mkc_torch.simulation.fmu.evaluation import Evaluation, EvaluationPoints
-from mkc_torch.simulation.fmu.function import evaluated
+from mkc_torch.simulation.fmu.evaluation import Evaluation
+from mkc_torch.simulation.foreign.evaluation import EvaluationPoints
+from mkc_torch.simulation.foreign.function import evaluated
 from mkc_torch.simulation.parameter import SimulationError
 
 if TYPE_CHECKING:

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mkc_torch.simulation.fmu.binary import Binary
 from mkc_torch.simulation.fmu.description import Description
+from mkc_torch.simulation.foreign.evaluation import CachedEvaluation, Group
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Array = NDArray[np.float64]
-
-Group = Literal["states", "inputs", "parameters"]
-GROUPS: tuple[Group, ...] = ("states", "inputs", "parameters")
-
-_REMEMBERED = 8
-"""Number of cached results: Newton's method repeats its last points, and a fit its final point."""
 
 _STEP = float(np.finfo(np.float64).eps) ** (1.0 / 3.0)
 """Relative step of a central difference, at which the errors by rounding and by curvature are similar."""
@@ -32,40 +26,7 @@ _AGREE = 1e-4
 """Relative difference between directional derivative and central difference up to which the former is used."""
 
 
-class EvaluationPoints:
-    """Times (S,), states (S, n), inputs (S, m) and parameters (p,), as contiguous arrays."""
-
-    def __init__(self, time: Array, states: Array, inputs: Array, parameters: Array) -> None:
-        self.parts = tuple(np.ascontiguousarray(part, np.float64) for part in (time, states, inputs, parameters))
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, EvaluationPoints) and all(map(np.array_equal, self.parts, other.parts))
-
-    __hash__ = None  # type: ignore[assignment]
-
-    def new(self) -> NDArray[np.bool_]:
-        """(S,), whether a point differs from the previous one: the end of an interval is the start of the next."""
-        table = np.concatenate([self.parts[0][:, None], *self.parts[1:3]], 1)
-        new = np.ones(len(table), np.bool_)
-        new[1:] = (table[1:] != table[:-1]).any(1)
-        return new
-
-    def same(self, other: EvaluationPoints) -> NDArray[np.bool_]:
-        """(S,), which points equal those of ``other``, such as the ends of intervals whose middles have moved."""
-        if len(other.parts[0]) != len(self.parts[0]) or not np.array_equal(self.parts[3], other.parts[3]):
-            return np.zeros(len(self.parts[0]), np.bool_)
-        alike = self.parts[0] == other.parts[0]
-        for k in (1, 2):
-            alike &= (self.parts[k] == other.parts[k]).all(1)
-        return alike
-
-    def rows(self, which: Any) -> tuple[Array, Array, Array]:
-        """Times, states and inputs of some of the points."""
-        time, states, inputs, _ = self.parts
-        return _rows((time, states, inputs), which)
-
-
-class Evaluation:
+class Evaluation(CachedEvaluation):
     """An FMU as a function of time, states, inputs and parameters that returns rates or outputs.
 
     Args:
@@ -73,12 +34,11 @@ class Evaluation:
     """
 
     def __init__(self, description: Description) -> None:
+        super().__init__()
         self.description = description
         self._binary: Binary | None = None
         self._trusted: dict[tuple[bool, int], bool] = {}
         self._affine: dict[tuple[bool, int], bool] = {}
-        self._last: dict[bool, tuple[EvaluationPoints, Array]] = {}
-        self._known: deque[tuple[Any, EvaluationPoints, Array]] = deque(maxlen=_REMEMBERED)
 
     def __getstate__(self) -> Description:
         return self.description
@@ -92,59 +52,21 @@ class Evaluation:
             self._binary = Binary(self.description)
         return self._binary
 
-    def values(self, outputs: bool, at: EvaluationPoints) -> Array:
-        """The rates of the states, or the outputs, (S, k); NaN where the FMU fails."""
+    def count(self, outputs: bool) -> int:
+        return len(self.description.outputs if outputs else self.description.rates)
 
-        def computed() -> Array:
-            new = at.new()
-            before, known = self._last.get(outputs, (None, None))
-            same = at.same(before) if before is not None else np.zeros_like(new)
-            missing = new & ~same
-            description = self.description
-            found = np.empty((len(new), len(description.outputs if outputs else description.rates)))
-            if known is not None and same.any():
-                found[same] = known[same]
-            found[missing] = self._uncached_values(outputs, at.rows(missing), at.parts[3])
-            found = found[np.maximum.accumulate(np.where(new, np.arange(len(new)), 0))]
-            self._last[outputs] = at, found
-            return found
-
-        return self._cached(("values", outputs), at, computed)
-
-    def slopes(self, outputs: bool, at: EvaluationPoints, group: Group) -> Array:
-        """Derivatives of rates or outputs by each variable of a group, (S, k, size of the group)."""
-
-        def computed() -> Array:
-            new = at.new()
-            given = at.parts[3]
-            base = self.values(outputs, at)[new] if group == "parameters" else None
-            columns = self._columns(outputs, at.rows(new), given, group, base)
-            return columns[new.cumsum() - 1]
-
-        return self._cached(("slopes", outputs, group), at, computed)
-
-    def _cached(self, what: Any, at: EvaluationPoints, compute: Any) -> Array:
-        for known, moments, answer in self._known:
-            if known == what and moments == at:
-                return answer
-        found: Array = compute()
-        self._known.append((what, at, found))
-        return found
-
-    def _uncached_values(self, outputs: bool, rows: tuple[Array, Array, Array], parameters: Array) -> Array:
+    def fresh(self, outputs: bool, rows: tuple[Array, Array, Array], parameters: Array) -> Array:
         if not self.binary.begin(parameters.tolist()):
-            description = self.description
-            return np.full((len(rows[0]), len(description.outputs if outputs else description.rates)), np.nan)
+            return np.full((len(rows[0]), self.count(outputs)), np.nan)
         return self.binary.values(outputs, *rows)
 
-    def _columns(
-        self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, base: Array | None
+    def columns(
+        self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, base: Array
     ) -> Array:
         description = self.description
         quantities = list(getattr(description, group))
         trusted = [self._is_trusted(outputs, rows, given, group, k) for k in range(len(quantities))]
-        count = len(description.outputs if outputs else description.rates)
-        found = np.empty((len(rows[0]), count, len(quantities)))
+        found = np.empty((len(rows[0]), self.count(outputs), len(quantities)))
         by = [k for k, usable in enumerate(trusted) if usable]
         if by and self.binary.begin(given.tolist()):
             references = [quantities[k].reference for k in by]
@@ -154,7 +76,7 @@ class Evaluation:
         for k in range(len(quantities)):
             if trusted[k]:
                 continue
-            if base is not None and self._is_affine(outputs, rows, given, k):
+            if group == "parameters" and self._is_affine(outputs, rows, given, k):
                 found[:, :, k] = self._one_sided_difference(outputs, rows, given, k, base, self._step_within(given, k))
             else:
                 found[:, :, k] = self._central_difference(outputs, rows, given, group, k)
@@ -167,7 +89,7 @@ class Evaluation:
         """
         if (outputs, place) not in self._affine:
             few = _rows(rows, slice(None, None, max(1, len(rows[0]) // 16)))
-            base = self._uncached_values(outputs, few, given)
+            base = self.fresh(outputs, few, given)
             step = self._step_within(given, place)
             near, far = (
                 self._one_sided_difference(outputs, few, given, place, base, step * more) for more in (1.0, 30.0)
@@ -183,7 +105,7 @@ class Evaluation:
         """The derivative by a parameter, (S, k), by a one-sided difference."""
         moved = given.copy()
         moved[place] += step
-        return (self._uncached_values(outputs, rows, moved) - base) / (moved[place] - given[place])
+        return (self.fresh(outputs, rows, moved) - base) / (moved[place] - given[place])
 
     def _step_within(self, given: Array, place: int) -> float:
         """A step of a parameter within its upper bound."""
@@ -221,7 +143,7 @@ class Evaluation:
             ends = [given.copy(), given.copy()]
             ends[0][place] = max(given[place] - step, parameter.lower)
             ends[1][place] = min(given[place] + step, parameter.upper)
-            low, high = (self._uncached_values(outputs, rows, end) for end in ends)
+            low, high = (self.fresh(outputs, rows, end) for end in ends)
             return (high - low) / (ends[1][place] - ends[0][place])
         table = states if group == "states" else inputs
         step = _step(table[:, place])
@@ -231,7 +153,7 @@ class Evaluation:
             moved[:, place] += sign * step
             places.append(moved[:, place])
             pair = (moved, inputs) if group == "states" else (states, moved)
-            answers.append(self._uncached_values(outputs, (time, *pair), given))
+            answers.append(self.fresh(outputs, (time, *pair), given))
         return (answers[1] - answers[0]) / (places[1] - places[0])[:, None]
 
 

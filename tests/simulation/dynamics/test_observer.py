@@ -85,9 +85,8 @@ def test_a_trajectory_with_jumps_matches_stepwise_integration_with_corrections(m
 def test_intervals_start_from_the_corrected_states():
     grid, jump = grid_of(11), random_correction(11)
     states = solve(pendulum, grid, tensor([[0.8, -0.3]]), torch.zeros(len(grid.time), 2).double(), jump=jump).states
-    step = grid.step.unsqueeze(-1)
-    torch.testing.assert_close(stations(pendulum, states, step, jump)[::3], jump.applied(states)[:-1])
-    torch.testing.assert_close(stations(pendulum, states, step)[::3], states[:-1])
+    torch.testing.assert_close(stations(pendulum, states, grid, jump)[::3], jump.applied(states)[:-1])
+    torch.testing.assert_close(stations(pendulum, states, grid)[::3], states[:-1])
 
 
 def test_a_growing_horizon_converges_from_a_far_guess():
@@ -166,7 +165,7 @@ def test_the_slope_of_a_jump_matches_finite_differences(seed, m, spread, more):
 def test_transitions_start_from_the_states_after_the_jump():
     grid, jump = grid_of(6), random_correction(6)
     states = solve(pendulum, grid, tensor([[0.8, 0.0]]), torch.zeros(21, 2).double(), jump=jump).states
-    A, _ = transition_matrices(pendulum, states, grid.step.unsqueeze(-1), jump)
+    A, _ = transition_matrices(pendulum, states, grid, jump)
     expected = []
     for moment in range(20):
         after = jump.applied(states)[moment]

@@ -10,8 +10,8 @@ pytest.importorskip("fmpy")
 
 from mkc_torch._support.forward_mode import _trusted, twice_reverse_tangents
 from mkc_torch.simulation import load_fmu
-from mkc_torch.simulation.fmu.evaluation import EvaluationPoints
-from mkc_torch.simulation.fmu.function import evaluated
+from mkc_torch.simulation.foreign.evaluation import EvaluationPoints
+from mkc_torch.simulation.foreign.function import evaluated
 from tests.simulation.fmu.made import COMPILER, PENDULUM, Model, make_fmu
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no compiler of C (cc, gcc or clang)")

@@ -1,4 +1,4 @@
-"""An FMU as a torch function with first derivatives in reverse mode, in forward mode and under ``vmap``.
+"""A simulation outside torch as a torch function with first derivatives: reverse mode, forward mode, ``vmap``.
 
 The derivatives by states, inputs and parameters are computed where a derivative is needed, and have no derivatives
 themselves. A vector-Jacobian product is linear in its vector, and so its derivative by the vector is exact; its
@@ -15,16 +15,16 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.torch_internals import is_wrapped
-from mkc_torch.simulation.fmu.evaluation import GROUPS, Evaluation, EvaluationPoints, Group
+from mkc_torch.simulation.foreign.evaluation import GROUPS, CachedEvaluation, EvaluationPoints, Group
 
 
 def evaluated(
-    evaluation: Evaluation, outputs: bool, time: Tensor, states: Tensor, inputs: Tensor, parameters: Tensor
+    evaluation: CachedEvaluation, outputs: bool, time: Tensor, states: Tensor, inputs: Tensor, parameters: Tensor
 ) -> Tensor:
-    """The rates (S, n), or the outputs (S, k), of an FMU.
+    """The rates (S, n), or the outputs (S, k), of a simulation.
 
     Args:
-        evaluation: evaluation of the FMU.
+        evaluation: its evaluation.
         outputs: return outputs instead of rates.
         time: (S,), in s.
         states, inputs: (S, n), (S, m).
@@ -36,7 +36,7 @@ def evaluated(
 class _Values(torch.autograd.Function):
     @staticmethod
     def forward(
-        evaluation: Evaluation, outputs: bool, time: Tensor, states: Tensor, inputs: Tensor, parameters: Tensor
+        evaluation: CachedEvaluation, outputs: bool, time: Tensor, states: Tensor, inputs: Tensor, parameters: Tensor
     ) -> Tensor:
         return _tensor(evaluation.values(outputs, _moments(time, states, inputs, parameters)), states)
 
@@ -71,14 +71,14 @@ class _Values(torch.autograd.Function):
         return total
 
     @staticmethod
-    def vmap(info: Any, in_dims: Any, evaluation: Evaluation, outputs: bool, *parts: Tensor) -> Any:
+    def vmap(info: Any, in_dims: Any, evaluation: CachedEvaluation, outputs: bool, *parts: Tensor) -> Any:
         return _over_batch(info, in_dims[2:], lambda *args: _values(evaluation, outputs, *args), parts), 0
 
 
 class _Slopes(torch.autograd.Function):
     @staticmethod
     def forward(
-        evaluation: Evaluation,
+        evaluation: CachedEvaluation,
         outputs: bool,
         group: Group,
         time: Tensor,
@@ -94,7 +94,10 @@ class _Slopes(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:  # noqa: ARG004 - signature of torch.autograd.Function
-        raise RuntimeError("An FMU has first derivatives only; the second derivatives of its equations are not known.")
+        raise RuntimeError(
+            "A simulation outside torch, such as an FMU, has first derivatives only; its second derivatives are "
+            "not known."
+        )
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:
@@ -102,7 +105,7 @@ class _Slopes(torch.autograd.Function):
         return known.new_zeros(ctx.shape)
 
     @staticmethod
-    def vmap(info: Any, in_dims: Any, evaluation: Evaluation, outputs: bool, group: Group, *parts: Tensor) -> Any:
+    def vmap(info: Any, in_dims: Any, evaluation: CachedEvaluation, outputs: bool, group: Group, *parts: Tensor) -> Any:
         return _over_batch(info, in_dims[3:], lambda *args: _slopes(evaluation, outputs, group, *args), parts), 0
 
 

@@ -1,0 +1,29 @@
+"""The map of a simulation that steps, such as a simulator of mechanisms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Steps:
+    """What is declared of a simulation that steps, instead of found in its equations.
+
+    Its ``derivative`` returns the change of the states over one step, divided by the length of the step.
+
+    Attributes:
+        size: length of a step in s.
+        positions: state that is a position, to the state that is its speed.
+        forces: input that is a force acting along a speed, to this speed; its column is 0 in every recording.
+        rollout: from a state (1, n), inputs (T, u) and the parameters to the states after each of T steps, (T, n),
+            without derivatives.
+    """
+
+    size: float
+    positions: Mapping[str, str]
+    forces: Mapping[str, str]
+    rollout: Callable[[Tensor, Tensor, Any], Tensor]

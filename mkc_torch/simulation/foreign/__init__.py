@@ -1,0 +1,1 @@
+"""Simulations whose functions are not of torch: their values and derivatives as torch functions."""

@@ -1,0 +1,137 @@
+"""Values and derivatives of a stepper's map at many points, by batches of steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from mkc_torch.simulation.foreign.evaluation import CachedEvaluation, EvaluationPoints, Group
+from mkc_torch.simulation.names import Names
+from mkc_torch.simulation.parameter import SimulationError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+_STEP = float(np.finfo(np.float64).eps) ** 0.5
+"""Relative step of a one-sided difference, at which the errors by rounding and by curvature are similar."""
+
+_NEAR = 1e-3
+"""Distance of points, as a share of each state, input and parameter, over which derivatives are the same."""
+
+_BATCH = 200_000
+"""Most steps in one call."""
+
+
+class Steps(Protocol):
+    """The functions of a stepper."""
+
+    time_step: float
+
+    @property
+    def name(self) -> str: ...
+    def step(self, x: Array, u: Array, tau: Array, p: Names, dt: float) -> Array: ...
+    def sensed(self, x: Array, u: Array, p: Names) -> Mapping[str, Array]: ...
+
+
+class StepperEvaluation(CachedEvaluation):
+    """The change of a stepper's states over one step divided by its length, and its outputs.
+
+    Args:
+        stepper: the simulation.
+        states, inputs, parameters: names in the order of the arrays; after the inputs come the forces.
+        shown: names of the outputs that are no states.
+    """
+
+    def __init__(
+        self,
+        stepper: Steps,
+        states: tuple[str, ...],
+        inputs: tuple[str, ...],
+        parameters: tuple[str, ...],
+        shown: tuple[str, ...] = (),
+    ) -> None:
+        super().__init__()
+        self.stepper, self.shown = stepper, shown
+        self._slopes: dict[tuple[bool, Group], tuple[EvaluationPoints, Array]] = {}
+        self.states, self.inputs, self.parameters = states, inputs, parameters
+
+    def __getstate__(self) -> tuple[object, ...]:
+        return self.stepper, self.states, self.inputs, self.parameters, self.shown
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        StepperEvaluation.__init__(self, *state)
+
+    def count(self, outputs: bool) -> int:
+        return len(self.shown) if outputs else len(self.states)
+
+    def fresh(self, outputs: bool, rows: tuple[Array, Array, Array], parameters: Array) -> Array:
+        _, states, given = rows
+        found = np.empty((len(states), self.count(outputs)))
+        for first in range(0, len(states), _BATCH):
+            part = slice(first, first + _BATCH)
+            found[part] = self._at(outputs, states[part], given[part], self._named(parameters))
+        return found
+
+    def slopes(self, outputs: bool, at: EvaluationPoints, group: Group) -> Array:
+        """Derivatives by each variable of a group, (S, k, size of the group); those of points nearby where known.
+
+        They are differences of many steps, and change no value: only how fast a solution converges.
+        """
+        known = self._slopes.get((outputs, group))
+        if known is None or not at.near(known[0], _NEAR):
+            known = self._slopes[outputs, group] = at, super().slopes(outputs, at, group)
+        return known[1]
+
+    def columns(
+        self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, base: Array
+    ) -> Array:
+        time, states, inputs = rows
+        if group == "parameters":
+            moved = [_moved(given, k, _STEP * (abs(value) or 1.0)) for k, value in enumerate(given)]
+            changes = [self.fresh(outputs, rows, values) - base for values in moved]
+            return _stacked([changes[k] / (moved[k][k] - given[k]) for k in range(len(given))], base)
+        table = states if group == "states" else inputs
+        slopes = []
+        for k in range(table.shape[1]):
+            moved_table = _moved(table.T, k, _difference(table[:, k])).T
+            pair = (moved_table, inputs) if group == "states" else (states, moved_table)
+            change = self.fresh(outputs, (time, *pair), given) - base
+            slopes.append(change / (moved_table[:, [k]] - table[:, [k]]))
+        return _stacked(slopes, base)
+
+    def _at(self, outputs: bool, states: Array, given: Array, p: Names) -> Array:
+        stepper, m = self.stepper, len(self.inputs)
+        u, tau = given[:, :m], given[:, m:]
+        if outputs:
+            shown: Mapping[str, Array] = stepper.sensed(states, u, p)
+            return np.stack([np.broadcast_to(shown[name], len(states)) for name in self.shown], 1)
+        after = np.asarray(stepper.step(states, u, tau, p, stepper.time_step), np.float64)
+        if after.shape != states.shape:
+            raise SimulationError(
+                f"{stepper.name}.step: expected states of shape {states.shape}, like x, but got {after.shape}."
+            )
+        return np.asarray((after - states) / stepper.time_step)
+
+    def _named(self, values: Array) -> Names:
+        return Names(**dict(zip(self.parameters, values.tolist(), strict=True)))
+
+
+def _moved(values: Array, place: int, step: float) -> Array:
+    """A copy with a step added to the values at one place of the first axis."""
+    found = values.copy()
+    found[place] += step
+    return found
+
+
+def _stacked(slopes: Sequence[Array], base: Array) -> Array:
+    return np.stack(slopes, -1) if slopes else np.empty((*base.shape, 0))
+
+
+def _difference(values: Array) -> float:
+    """A step for a whole column by its mean absolute value, because a value near 0 has no scale."""
+    size = float(np.abs(values).mean()) if len(values) else 1.0
+    return _STEP * (size if 0.0 < size < np.inf else 1.0)

@@ -1,0 +1,154 @@
+"""A MuJoCo model as a simulation that steps."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, TypeGuard
+
+import numpy as np
+
+from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.dynamics.correction import DynamicsCorrection
+from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+from mkc_torch.simulation.names import Names
+from mkc_torch.simulation.parameter import SimulationError
+from mkc_torch.simulation.stepped.mujoco.description import Description, described
+from mkc_torch.simulation.stepped.stepper import Stepper
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+
+class MujocoStepper(Stepper):
+    """A MuJoCo model; :func:`mjcf_class` makes a class of a file, with its names, parameters and units.
+
+    The states are the positions and speeds of its joints and the activations of its actuators; each step is MuJoCo's
+    own, with the model's integrator and time step. Forces act at the joints (``qfrc_applied``), through the masses.
+
+    Attributes:
+        description: the model with its names.
+    """
+
+    description: ClassVar[Description]
+
+    def step(  # type: ignore[override]
+        self, x: Array, u: Array, tau: Array, p: Names, dt: float
+    ) -> Array:
+        return self._engine.stepped(x, u, tau, vars(p))[0]
+
+    def rollout(self, x: Array, u: Array, tau: Array, p: Names, dt: float) -> Array:
+        return self._engine.rolled_out(x, u, tau, vars(p))
+
+    def sensed(self, x: Array, u: Array, p: Names) -> Mapping[str, Array]:
+        shown = self._engine.stepped(x, u, np.zeros((len(x), len(self.forces))), vars(p))[1]
+        return {name: shown[:, place] for name, place in self.description.sensors.items()}
+
+    def prepare(self, recording: Recording) -> PreparedDynamics:
+        """The simulation together with a recording.
+
+        Raises:
+            MissingColumnError: the recording lacks ``time`` or the control of an actuator.
+            SimulationError: none of the joints and sensors is a column of the recording.
+        """
+        shown = (*self.states, *self.description.sensors)
+        measured = self.outputs or tuple(name for name in shown if name in recording)
+        if not measured:
+            raise SimulationError(
+                f"{self.name}: no joint and no sensor of the model is a column of the recording. The model has "
+                f"{', '.join(shown)}; the recording has {', '.join(recording.names)}. Assign the columns with "
+                "--columns NAME=COLUMN."
+            )
+        own = copy.copy(self)
+        own.__dict__.pop("_evaluation", None)
+        own.outputs = measured
+        return super(MujocoStepper, own).prepare(recording)
+
+    @property
+    def saved(self) -> Mapping[str, object]:  # type: ignore[override]
+        """The patterns that chose the fitted numbers."""
+        patterns = self.description.fitted
+        return {} if patterns is None else {"fitted": list(patterns)}
+
+    def correction(self, state: Mapping[str, Any], recording: Recording) -> DynamicsCorrection:
+        patterns = state.get("fitted")
+        if is_of_a_model(type(self)) and patterns != self.saved.get("fitted"):
+            return load_mjcf(self.description.path, patterns).correction(state, recording)
+        return super().correction(state, recording)
+
+    def __reduce__(self) -> Any:
+        state = {name: value for name, value in vars(self).items() if name not in ("_engine", "_evaluation")}
+        if is_of_a_model(type(self)):  # such a class cannot be imported by name
+            return load_mjcf, (str(self.description.path), self.description.fitted), state
+        return type(self), (), state
+
+    @cached_property
+    def _engine(self) -> Any:
+        from mkc_torch.simulation.stepped.mujoco.engine import Engine
+
+        return Engine(self.description)
+
+
+def load_mjcf(path: str | Path, fitted: Sequence[str] | None = None) -> MujocoStepper:
+    """Load a MuJoCo model, MJCF or URDF.
+
+    Args:
+        path: of the file.
+        fitted: patterns of the numbers to fit, "joint:*.damping" say; None for those that the file gives.
+
+    Raises:
+        MjcfError: MuJoCo refuses the file, or the model has parts that cannot be diagnosed.
+        ImportError: MuJoCo is not installed.
+    """
+    return _class_of(described(Path(path), fitted))()
+
+
+def mjcf_class(path: str | Path, file: str | None = None, fitted: Sequence[str] | None = None) -> type[MujocoStepper]:
+    """A class of a MuJoCo model, to derive from like :class:`mkc_torch.simulation.Stepper`.
+
+    Args:
+        path: of the MJCF or URDF file.
+        file: ``__file__`` of the calling file, to whose folder the path is relative; None for the current folder.
+        fitted: as in :func:`load_mjcf`.
+
+    Raises:
+        MjcfError: MuJoCo refuses the file, or the model has parts that cannot be diagnosed.
+        ImportError: MuJoCo is not installed.
+    """
+    place = Path(path)
+    if file is not None:
+        folder = Path(file).resolve().parent
+        places = [folder / path, folder / place.name, Path.cwd() / place.name]
+        place = next((path for path in places if path.is_file()), places[0])
+    return _class_of(described(place, fitted))
+
+
+def is_of_a_model(kind: type) -> TypeGuard[type[MujocoStepper]]:
+    """Whether a class was made of a MuJoCo model, and not derived from such a class.
+
+    Example:
+        >>> is_of_a_model(dict)
+        False
+    """
+    return issubclass(kind, MujocoStepper) and "description" in vars(kind)
+
+
+def _class_of(found: Description) -> type[MujocoStepper]:
+    body = {
+        "__doc__": f"The model {found.path.name}.",
+        "description": found,
+        "states": found.states,
+        "inputs": found.inputs,
+        "positions": found.positions,
+        "forces": found.forces,
+        "parameters": found.parameters,
+        "units": found.units,
+        "initial": found.initial,
+        "time_step": found.time_step,
+        "step": MujocoStepper.step,
+    }
+    return type(found.name, (MujocoStepper,), body)

@@ -1,0 +1,202 @@
+"""The base class of a simulation that steps, in any engine.
+
+Its states follow the map of its own steps, not a differential equation: the recurrence from sample to sample that
+:mod:`mkc_torch.simulation.dynamics.trajectory` solves is that map.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.dynamics.definition import Dynamics
+from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+from mkc_torch.simulation.dynamics.steps import Steps
+from mkc_torch.simulation.foreign.function import evaluated
+from mkc_torch.simulation.names import Names
+from mkc_torch.simulation.parameter import SimulationError
+from mkc_torch.simulation.stepped.evaluation import StepperEvaluation
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+
+class Stepper(Dynamics):
+    """A simulation that steps; subclasses define names, parameters and ``step``, on NumPy arrays.
+
+    Attributes:
+        states: names of the states.
+        inputs: names of the columns that drive the simulation; they are held over each step.
+        outputs: names of the columns that it predicts; default: the states that are columns of the recording.
+        positions: state that is a position, to the state that is its speed.
+        forces: force that effects may add, to the state that is the speed along which it acts. A force at each joint
+            acts through the simulation's own masses. Its name is free: it is no column of the recording.
+        parameters: start value, or :class:`Parameter`, by name.
+        initial: guess of the initial value by state, for states that are not measured; default 0.
+        units: unit by state, input or force; the unit of a force is that of the sizes of effects there.
+        time_step: length of a step in s. Samples are as many steps apart as is nearest, at least one.
+
+    Raises:
+        SimulationError: no ``time_step``, a ``step`` that returns another shape, or a recording with a column that has
+            the name of a force.
+
+    Example:
+        A mass that a force accelerates, by semi-implicit Euler steps:
+
+        >>> import numpy as np
+        >>> class Mass(Stepper):
+        ...     states, inputs, time_step = ("place", "speed"), ("drive",), 0.01
+        ...     positions, forces = {"place": "speed"}, {"force": "speed"}
+        ...     units = {"place": "m", "speed": "m/s", "drive": "N", "force": "N"}
+        ...     parameters = {"mass": 2.0}
+        ...
+        ...     def step(self, x, u, tau, p, dt):
+        ...         speed = x[:, 1] + dt * (u[:, 0] + tau[:, 0]) / p.mass
+        ...         return np.stack([x[:, 0] + dt * speed, speed], 1)
+        >>> time = torch.arange(0.0, 1.0, 0.02, dtype=torch.float64)
+        >>> recording = Recording({"time": time, "drive": time * 0.0 + 2.0, "place": 0.5 * time**2})
+        >>> Mass().prepare(recording).ports["entry of force"].unit
+        'N'
+    """
+
+    positions: Mapping[str, str] = {}
+    forces: Mapping[str, str] = {}
+    time_step: float = 0.0
+    input_hold = "held"
+
+    def step(  # type: ignore[override]
+        self, x: Array, u: Array, tau: Array, p: Names, dt: float
+    ) -> Array:
+        """Return the states after one step.
+
+        Args:
+            x: (B, states), independent states before the step, whose next ones are computed in one call.
+            u: (B, inputs), held over the step.
+            tau: (B, forces), additional forces, held over the step.
+            p: the parameters as attributes, a number each.
+            dt: length of the step in s.
+
+        Returns:
+            (B, states); NaN where the simulation fails.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} has no `step(self, x, u, tau, p, dt)`; define it to return the states after one "
+            "step, an array like x."
+        )
+
+    def sensed(self, x: Array, u: Array, p: Names) -> Mapping[str, Array]:
+        """Return the outputs that are no states by column name, (B,) each; default: none.
+
+        Args:
+            x, u: (B, states), (B, inputs).
+            p: the parameters as attributes.
+        """
+        return {}
+
+    def rollout(self, x: Array, u: Array, tau: Array, p: Names, dt: float) -> Array:
+        """Return the states after each of T steps from one state; a faster way than single steps may replace it.
+
+        Args:
+            x: (states,), before the first step.
+            u, tau: (T, inputs), (T, forces).
+            p, dt: as in ``step``.
+
+        Returns:
+            (T, states).
+        """
+        found = np.empty((len(u), len(x)))
+        for k in range(len(u)):
+            x = self.step(x[None], u[[k]], tau[[k]], p, dt)[0]
+            found[k] = x
+        return found
+
+    @property
+    def steps(self) -> Steps:  # type: ignore[override]
+        return Steps(self.time_step, self.positions, self.forces, self._rolled_out)
+
+    @property
+    def columns(self) -> frozenset[str]:
+        return super().columns | frozenset(self.forces)
+
+    def derivative(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor]:
+        """Return the change of the states over one step divided by its length."""
+        rates = self._evaluated(False, time, x, u, p)
+        return dict(zip(self._evaluation.states, rates.unbind(-1), strict=True))
+
+    def output(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor]:
+        found = dict(vars(x))
+        if self._evaluation.shown:
+            values = self._evaluated(True, time, x, u, p)
+            found |= dict(zip(self._evaluation.shown, values.unbind(-1), strict=True))
+        return found
+
+    def prepare(self, recording: Recording) -> PreparedDynamics:
+        """Prepare the simulation of a recording, see :meth:`mkc_torch.simulation.Dynamics.prepare`."""
+        if not self.time_step > 0.0:
+            raise SimulationError(f"{self.name}: `time_step` expected a length in s above 0, got {self.time_step!r}.")
+        own = copy.copy(self)
+        own.inputs = (*self._driven, *self.forces)
+        return Dynamics.prepare(own, _with_forces(recording, self))
+
+    @property
+    def _driven(self) -> tuple[str, ...]:
+        """The inputs that are columns of a recording."""
+        return tuple(name for name in self.inputs if name not in self.forces)
+
+    @cached_property
+    def _evaluation(self) -> StepperEvaluation:
+        # a derived class, such as a corrected one, may have more states than its base steps
+        base = next(kind for kind in type(self).__mro__ if "step" in vars(kind))
+        states = base.states if issubclass(base, Stepper) and base.states else self.states
+        known = (*states, *self._driven)
+        shown = tuple(name for name in self.outputs if name not in known)
+        return StepperEvaluation(self, states, self._driven, tuple(self.parameters), shown)
+
+    def _rolled_out(self, state: Tensor, inputs: Tensor, p: Any) -> Tensor:
+        """The states after each step, as a tensor."""
+        m = len(self._driven)
+        given, named = inputs.detach().cpu().numpy(), Names(**{name: float(value) for name, value in vars(p).items()})
+        x = state[0].detach().cpu().numpy()
+        return torch.from_numpy(self.rollout(x, given[:, :m], given[:, m:], named, self.time_step)).to(state)
+
+    def _evaluated(self, outputs: bool, time: Tensor, x: Any, u: Any, p: Any) -> Tensor:
+        evaluation = self._evaluation
+        states = torch.stack(torch.broadcast_tensors(*(getattr(x, name) for name in evaluation.states)), -1)
+        rows = states.shape[0]
+        given = vars(u)
+        columns = [given[name].expand(rows) for name in evaluation.inputs]
+        # forces are 0 for a caller that has none
+        columns += [given[name].expand(rows) if name in given else states.new_zeros(rows) for name in self.forces]
+        inputs = torch.stack(columns, -1) if columns else states.new_zeros(rows, 0)
+        known = [getattr(p, name) for name in evaluation.parameters]
+        parameters = torch.stack(known) if known else states.new_zeros(0)
+        return evaluated(evaluation, outputs, time.expand(rows), states, inputs, parameters)
+
+
+def _with_forces(recording: Recording, stepper: Stepper) -> Recording:
+    """The recording with a column of zeros for each force."""
+    taken = [name for name in stepper.forces if name in recording]
+    if taken:
+        raise SimulationError(
+            f"{stepper.name}: the recording has a column `{taken[0]}`, the name of a force at which effects act; "
+            "rename the column, or make the recorded force an input."
+        )
+    zeros = {name: torch.zeros(len(recording), dtype=torch.float64) for name in stepper.forces}
+    units = {name: stepper.units[name] for name in stepper.forces if name in stepper.units}
+    return Recording(
+        {**recording.columns, **zeros},
+        name=recording.name,
+        units={**recording.units, **units},
+        warnings=recording.warnings,
+        labels=recording.labels,
+        notes=recording.notes,
+    )

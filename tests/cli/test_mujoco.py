@@ -1,0 +1,80 @@
+"""A model of MuJoCo on the command line: its diagnosis and its files, and the errors of its options."""
+
+import pytest
+import torch
+
+pytest.importorskip("mujoco")
+pytest.importorskip("typer")
+pytest.importorskip("polars")
+pytest.importorskip("jsonschema")
+
+from mkc_torch.recording import Recording
+from mkc_torch.simulation import load_mjcf
+from tests.cli.commands import flat, mkc
+from tests.docs.files import write_swing
+
+FRICTION = 0.06
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The manual's model, and its recording of the same model with dry friction, by finer steps of MuJoCo."""
+    write_swing(tmp_path, friction=FRICTION)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.e2e
+def test_hidden_dry_friction_is_named_at_the_joint_and_written_into_the_model(folder):
+    mkc("diagnose", "SWING.csv", "--simulation", "swing.xml", "--output", "results", "--quick")
+    written = folder / "results" / "SWING"
+    assert "entry of hinge_force" in (written / "diagnosis.json").read_text()
+    new = load_mjcf(written / "corrected.xml").parameters
+    assert new["hinge_frictionloss"].value == pytest.approx(FRICTION, abs=0.02)
+    applied = mkc("apply", written / "model.json", "SWING.csv", "--simulation", "swing.xml", "--output", "sim.csv")
+    assert applied.exit_code == 0, applied.output
+    recording, simulated = Recording.read("SWING.csv"), Recording.read("sim.csv")
+    with_findings = (simulated["hinge_simulated"] - recording["hinge"]).square().mean().sqrt()
+    prepared = load_mjcf("swing.xml").prepare(recording)
+    assert with_findings < 0.3 * prepared.residual(prepared.given, {}).square().mean().sqrt()
+
+
+def test_a_recording_with_the_columns_of_a_model_is_written(folder):
+    done = mkc("new-simulation", "example", "--from", "swing.xml")
+    assert done.exit_code == 0, done.output
+    assert Recording.read("example.csv").names == ("time", "drive", "hinge")
+    assert "mkc diagnose YOURS.csv --simulation swing.xml" in flat(done.output)
+    again = mkc("new-simulation", "example", "--from", "swing.xml")
+    assert again.exit_code == 1
+    assert "example.csv exists" in flat(again.output)
+
+
+def test_the_places_of_a_model_are_listed(folder):
+    done = mkc("effects", "--simulation", "swing.xml")
+    assert "coulomb_friction@hinge_force" in done.output
+    assert "input_delay@drive" in done.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--simulation", "swing.xml", "--fit", "joint:wrist.*"), "no number of the model has this name"),
+        (("--simulation", "swing.xml", "--fit", "joint:*,"), "--fit has an empty part"),
+        (("--simulation", "own.py:Own", "--fit", "joint:*"), "--fit applies to a model of MuJoCo"),
+        (("--simulation", "absent.xml"), "there is no such file"),
+    ],
+)
+def test_wrong_options_are_refused(folder, arguments, message):
+    done = mkc("diagnose", "SWING.csv", *arguments)
+    assert done.exit_code != 0
+    assert message in flat(done.output)
+    assert not (folder / "results" / "SWING").exists()
+
+
+def test_a_model_json_keeps_which_numbers_were_fitted(folder):
+    recording = Recording.read("SWING.csv")
+    state = load_mjcf("swing.xml", ["joint:hinge.damping"]).prepare(recording).state
+    assert state["fitted"] == ["joint:hinge.damping"]
+    correction = load_mjcf("swing.xml").correction({**state, "fitted": ["joint:*.damping"]}, recording)
+    assert list(correction.prepared.known) == ["hinge_damping"]
+    assert torch.equal(correction.prepared.time, recording["time"])
