@@ -285,9 +285,20 @@ def inseparable(finding: Finding) -> tuple[Alternative, ...]:
 
 
 def stated_parameters(finding: Finding) -> tuple[EffectParameter, ...]:
-    """Return the parameters that are stated: of a curve those of its form, since its coefficients are no values."""
+    """Return the parameters that are stated: of a curve those of its form, since its coefficients are no values.
+
+    A share of 1, a whole lag say, is left out where other parameters give the size.
+
+    Example:
+        >>> lag = EffectParameter("share", 1.0, 0.0, ""), EffectParameter("lag", 0.2, None, "s", of_shape=True)
+        >>> found = Finding("sensor_lag", (), ("output",), (), None, "", "", lag, 0.01, (), True, "")
+        >>> [parameter.name for parameter in stated_parameters(found)]
+        ['lag']
+    """
     if not is_curve(finding.effect):
-        return finding.parameters
+        whole = [p for p in finding.parameters if p.name == "share" and p.value == 1.0 and not p.standard_error]
+        others = tuple(p for p in finding.parameters if p not in whole)
+        return others or finding.parameters
     return tuple(parameter for parameter in finding.parameters if parameter.of_shape)
 
 

@@ -9,7 +9,16 @@ from mkc_torch._support.typesetting import capital, plain, typeset
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.effects import is_curve
 from mkc_torch.report.diagnosis.environment import noise_lines, output_lines
-from mkc_torch.report.diagnosis.findings import acts_on, curve_values, finding_name, grade, inseparable, rivals, where
+from mkc_torch.report.diagnosis.findings import (
+    acts_on,
+    curve_values,
+    finding_name,
+    grade,
+    inseparable,
+    rivals,
+    stated_parameters,
+    where,
+)
 from mkc_torch.report.diagnosis.noise import noise_model, smooth_fit
 from mkc_torch.report.diagnosis.numbers import at_input, clock_of, evidence, largest, probability
 from mkc_torch.report.diagnosis.unseen import better, diverged, residual_of_all, residuals
@@ -100,7 +109,8 @@ def _sizes(finding: Finding, most: int) -> str:
     if is_curve(finding.effect):
         values = curve_values(finding)
         return "; ".join(dict.fromkeys([*values[:1], *values[-1:]]))
-    return "; ".join(filter(None, [*(largest(p) for p in finding.parameters[:most]), at_input(finding.at_input)]))
+    sizes = (largest(parameter) for parameter in stated_parameters(finding)[:most])
+    return "; ".join(filter(None, [*sizes, at_input(finding.at_input)]))
 
 
 def _closed(sentence: str) -> str:
