@@ -334,7 +334,7 @@ def test_invalid_simulation_options_exit_with_two(thermistor):
     source, table, output = thermistor
     for more, words in (
         (("--simulation", source, "--simulator-output", table), "give one of --simulation and --simulator-output"),
-        (("--simulation", "bench"), "your own simulation as FILE.py:CLASS or MODEL.fmu"),
+        (("--simulation", "bench"), "your own simulation as FILE.py:CLASS, MODEL.fmu or MODEL.xml"),
     ):
         result = mkc("diagnose", table, "--output", output, *more)
         assert result.exit_code == 2

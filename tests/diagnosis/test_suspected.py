@@ -119,12 +119,12 @@ def test_a_suspected_set_is_compared_with_the_findings_or_with_the_simulation_al
 
     name = "The suspected coulomb_friction@rate"
     sizes = "Its sizes: friction 0.31 rad/s² of coulomb_friction@rate."
-    assert sentence(SUSPECTED) == f"{name} scores 12.3 nats less than the findings; it leaves 0.0139 rad. {sizes}"
-    assert sentence(SUSPECTED, findings=False).startswith(f"{name} scores 37.7 nats more than the simulation alone;")
+    assert sentence(SUSPECTED) == f"{name} scores 12.3 less than the findings; it leaves 0.0139 rad. {sizes}"
+    assert sentence(SUSPECTED, findings=False).startswith(f"{name} scores 37.7 more than the simulation alone;")
     lost = ScoredModel(SUSPECTED.terms, "suspected", None, {}, "", {}, suspected=True)
     assert sentence(lost) == f"{name} has no score: no fit with it follows the recording."
     runaway = ScoredModel(SUSPECTED.terms, "suspected", 881.0, {}, "white", {}, suspected=True)
-    expected = f"{name} scores 31 nats more than the findings; its open-loop simulation loses the recording."
+    expected = f"{name} scores 31 more than the findings; its open-loop simulation loses the recording."
     assert sentence(runaway) == expected
     assert suspected_sentences(Trail((ALONE, FOUND)), {}, findings=True) == ()
 
@@ -142,5 +142,5 @@ def test_the_page_has_the_sentence():
 
     diagnosis = make_diagnosis(0, environment=make_environment(), decisions=Trail((ALONE, SUSPECTED)))
     page = diagnosis_report(diagnosis)
-    assert "The suspected coulomb_friction@rate scores 37.7 nats more than the simulation alone" in page
+    assert "The suspected coulomb_friction@rate scores 37.7 more than the simulation alone" in page
     assert "<strong>suspected</strong>" in page

@@ -67,8 +67,11 @@ class ObservedDynamics:
 
     prior: GaussianPrior | None = None
     faults: tuple[str, ...] = ()
-    jacobian: Literal["reverse twice"] = "reverse twice"
-    """A user's equations are many small operations."""
+
+    @property
+    def jacobian(self) -> Literal["forward", "reverse twice"]:
+        """A user's equations are many small operations, and a simulation that steps is a single large operation."""
+        return "reverse twice" if self.system.steps is None else "forward"
 
     def parameters_of(self, theta: Tensor) -> Names:
         """The parameters of the equations by name."""

@@ -391,8 +391,11 @@ class PreparedDynamics(CheckedDynamics):
 
     def _rates(self, acting: Acting, states: Tensor) -> list[Tensor]:
         """Rates of the states by the simulation's own equations."""
-        u = namespace(self.system.inputs, acting.inputs)
-        return self._derivative(self.clock.time, states, u, acting.parameters)
+        every = 1 if self.grid.map_step is None else 3
+        u = namespace(self.system.inputs, acting.inputs[::every])
+        rates = self._derivative(self.clock.time[::every], states[::every], u, acting.parameters)
+        # the stations of a step are the same, and only the first has derivatives
+        return rates if every == 1 else [torch.stack([r, r.detach(), r.detach()], -1).flatten() for r in rates]
 
     def _signal(self, port: Port, acting: Acting, states: Tensor, rates: Sequence[Tensor]) -> Float[Tensor, "S k"]:
         """Signal at a rate port: the states and inputs, then the rate or the load where the port has it."""

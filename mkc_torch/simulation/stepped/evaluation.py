@@ -99,7 +99,8 @@ class StepperEvaluation(CachedEvaluation):
         for k in range(table.shape[1]):
             moved_table = _moved(table.T, k, _difference(table[:, k])).T
             pair = (moved_table, inputs) if group == "states" else (states, moved_table)
-            change = self.fresh(outputs, (time, *pair), given) - base
+            with np.errstate(invalid="ignore"):  # where the simulation fails
+                change = self.fresh(outputs, (time, *pair), given) - base
             slopes.append(change / (moved_table[:, [k]] - table[:, [k]]))
         return _stacked(slopes, base)
 

@@ -145,7 +145,7 @@ def test_a_single_interval_is_solved():
     begin = torch.ones(1, 1, dtype=torch.float64)
     found = solve(lambda x: -x, grid, begin, begin.expand(2, 1))
     assert found.converged
-    assert stations(lambda x: -x, found.states, torch.tensor([[0.1]])).shape == (3, 1)
+    assert stations(lambda x: -x, found.states, grid).shape == (3, 1)
     assert float(found.states[1]) == pytest.approx(np.exp(-0.1), rel=1e-7)
 
 
@@ -153,7 +153,7 @@ def test_stations_lie_on_the_trajectory():
     time = even_times(4.0, 201)
     expected = reference(pendulum, [1.0, 0.0], time.numpy())
     found = solve(pendulum, grid_of(time), expected[:1], expected)
-    found_between = stations(pendulum, found.states, grid_of(time).step.unsqueeze(-1))
+    found_between = stations(pendulum, found.states, grid_of(time))
     between = reference(pendulum, [1.0, 0.0], np.linspace(0.0, 4.0, 401))[1::2]
     torch.testing.assert_close(found_between[1::3], between, rtol=0.0, atol=1e-5)
     torch.testing.assert_close(found_between[::3], found.states[:-1], rtol=0.0, atol=1e-12)
