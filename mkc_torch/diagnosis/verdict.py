@@ -403,8 +403,8 @@ def conclusion_of(trail: Trail) -> Conclusion:
 
     Example:
         >>> found = conclusion_of(Trail())
-        >>> found.verdict, found.status, found.doubtful
-        ('adequate', 'good', False)
+        >>> found.verdict, found.answer, found.doubtful
+        ('adequate', 'usable', False)
     """
     return conclude(verdict_of(trail), grades_of(trail), failed_rules(trail), near_noise=is_near_noise(trail))
 
