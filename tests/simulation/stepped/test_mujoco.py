@@ -190,6 +190,31 @@ def test_models_that_cannot_be_used_are_refused(tmp_path, text, message):
         load_mjcf(tmp_path / "arm.xml")
 
 
+SHELL = """
+<mujoco><asset><texture name="wood" type="2d" file="wood.png"/><material name="wood" texture="wood"/>
+<mesh name="shell" file="shell.stl"/></asset><worldbody><body><joint name="pan" axis="0 1 0" damping="0.1"/>
+<inertial pos="0 0 -.2" mass="1" diaginertia=".01 .01 .01"/>
+<geom type="mesh" mesh="shell" material="wood" contype="0" conaffinity="0"/>
+</body></worldbody></mujoco>
+"""
+
+
+def test_a_model_without_the_files_of_its_looks_is_loaded_and_written(tmp_path):
+    from mkc_torch.simulation.stepped.mujoco.corrected import corrected_xml
+
+    (tmp_path / "arm.xml").write_text(SHELL)
+    description = load_mjcf(tmp_path / "arm.xml").description
+    assert description.model.body_mass[1] == 1.0
+    (tmp_path / "new.xml").write_text(corrected_xml(description, {"pan_damping": 0.2}, {}))
+    assert load_mjcf(tmp_path / "new.xml").parameters["pan_damping"].value == 0.2
+
+
+def test_a_missing_file_of_a_part_that_collides_is_named(tmp_path):
+    (tmp_path / "arm.xml").write_text(SHELL.replace(' contype="0" conaffinity="0"', ""))
+    with pytest.raises(MjcfError, match=r"arm\.xml: MuJoCo refuses the model: .*shell\.stl"):
+        load_mjcf(tmp_path / "arm.xml")
+
+
 def test_a_pattern_that_matches_no_number_lists_the_numbers(two_links):
     with pytest.raises(SimulationError, match=r"--fit joint:wrist\.\*: no number .*joint:elbow\.damping"):
         load_mjcf(two_links, ["joint:wrist.*"])

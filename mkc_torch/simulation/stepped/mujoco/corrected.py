@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 
 from mkc_torch.simulation.stepped.mujoco.description import Description
+from mkc_torch.simulation.stepped.mujoco.visuals import drop_visuals
 
 _OF_ACTUATORS = {"actuator_gainprm": "gainprm", "actuator_biasprm": "biasprm"}
 
@@ -22,6 +23,8 @@ def corrected_xml(
         values: fitted number by parameter name.
         added: joint and attribute, ("elbow", "frictionloss") say, to what is added to the attribute, in its unit.
         note: appended to the comment at the top of the file.
+
+    Where files of meshes are missing, the parts that only are seen are left out.
 
     Example:
         >>> from pathlib import Path
@@ -50,7 +53,11 @@ def corrected_xml(
         _set(part, attribute, _linear(getattr(part, attribute)) + amount)
     if note:
         spec.comment = f"{spec.comment} {note}".strip()
-    text: str = spec.to_xml()
+    try:
+        text: str = spec.to_xml()
+    except ValueError:  # files of meshes are missing
+        drop_visuals(spec)
+        text = spec.to_xml()
     return text
 
 

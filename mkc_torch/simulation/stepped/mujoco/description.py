@@ -70,8 +70,12 @@ def described(path: Path, fitted: Sequence[str] | None) -> Description:
     mujoco = the_library()
     if not path.is_file():
         raise MjcfError(f"{path}: there is no such file.")
+    from mkc_torch.simulation.stepped.mujoco.visuals import drop_visuals
+
     try:
-        model = mujoco.MjModel.from_xml_path(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
+        drop_visuals(spec)
+        model = spec.compile()
     except ValueError as error:
         raise MjcfError(f"{path}: MuJoCo refuses the model: {error}") from None
     hinge_kind, slide_kind = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
