@@ -30,6 +30,10 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 
+_UNEVEN = 0.002
+"""Difference of the time between samples from whole steps, as a share, from which it is stated."""
+
+
 class Stepper(Dynamics):
     """A simulation that steps; subclasses define names, parameters and ``step``, on NumPy arrays.
 
@@ -198,5 +202,31 @@ def _with_forces(recording: Recording, stepper: Stepper) -> Recording:
         units={**recording.units, **units},
         warnings=recording.warnings,
         labels=recording.labels,
-        notes=recording.notes,
+        notes=(*recording.notes, *_about_steps(recording, stepper)),
     )
+
+
+def _about_steps(recording: Recording, stepper: Stepper) -> tuple[str, ...]:
+    """A sentence where the samples are no whole number of steps apart; empty where they are."""
+    gaps = recording["time"].diff() if "time" in recording else torch.zeros(0)
+    gaps = gaps[gaps > 0]
+    if not len(gaps):
+        return ()
+    sample = float(gaps.median())
+    steps = max(round(sample / stepper.time_step), 1)
+    if abs(sample - steps * stepper.time_step) <= _UNEVEN * sample:
+        return ()
+    return (
+        f"Samples are {sample:.4g} s apart, and a step of {stepper.name} lasts {stepper.time_step:.4g} s: for each "
+        f"sample {several_steps(steps)} taken, as if they lasted {sample / steps:.4g} s each.",
+    )
+
+
+def several_steps(count: int) -> str:
+    """The number of steps with its verb.
+
+    Example:
+        >>> several_steps(1), several_steps(4)
+        ('1 step is', '4 steps are')
+    """
+    return "1 step is" if count == 1 else f"{count} steps are"

@@ -92,6 +92,15 @@ def test_a_gap_between_samples_has_as_many_steps_as_it_lasts():
     )
 
 
+def test_samples_that_are_no_whole_steps_apart_are_stated():
+    uneven = Steps().prepare(recording_of(sample=0.0203)).recording.notes
+    assert uneven == (
+        "Samples are 0.0203 s apart, and a step of Steps lasts 0.01 s: for each sample 2 steps are taken, as if they "
+        "lasted 0.01015 s each.",
+    )
+    assert Steps().prepare(recording_of()).recording.notes == ()
+
+
 def test_each_run_has_its_own_start_and_forces_are_no_columns():
     two = torch.arange(60) // 30
     recording = recording_of(experiment=two.double())

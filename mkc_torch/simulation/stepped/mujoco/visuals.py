@@ -17,7 +17,7 @@ def drop_visuals(spec: Any) -> None:
     """
     for geom in list(spec.geoms):
         body = geom.parent
-        if geom.contype == 0 and geom.conaffinity == 0 and (body.explicitinertial or body.name == "world"):
+        if geom.contype == 0 and geom.conaffinity == 0 and (body.explicitinertial or body.name == spec.worldbody.name):
             spec.delete(geom)
     for skin in list(spec.skins):
         spec.delete(skin)
