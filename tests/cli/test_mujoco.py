@@ -1,5 +1,10 @@
 """A model of MuJoCo on the command line: its diagnosis and its files, and the errors of its options."""
 
+import json
+import re
+import subprocess
+import sys
+
 import pytest
 import torch
 
@@ -37,6 +42,17 @@ def test_hidden_dry_friction_is_named_at_the_joint_and_written_into_the_model(fo
     with_findings = (simulated["hinge_simulated"] - recording["hinge"]).square().mean().sqrt()
     prepared = load_mjcf("swing.xml").prepare(recording)
     assert with_findings < 0.3 * prepared.residual(prepared.given, {}).square().mean().sqrt()
+    write_swing(folder, "NEW", friction=FRICTION, seed=1)
+    checked = mkc("check", written / "model.json", "NEW.csv", "--simulation", "swing.xml", "--output", "checks")
+    assert checked.exit_code == 0, checked.output
+    assert "holds" in checked.output
+    alone = subprocess.run(
+        [sys.executable, written / "corrected.py", "NEW.csv"], capture_output=True, text=True, check=False
+    )
+    assert alone.returncode == 0, alone.stderr
+    check = json.loads((folder / "checks" / "NEW" / "check.json").read_text())
+    printed = float(re.search(r"hinge: (\S+) rad", alone.stdout)[1])
+    assert printed == pytest.approx(check["outputs"]["hinge"]["rmse_corrected"], rel=1e-4)
 
 
 def test_a_recording_with_the_columns_of_a_model_is_written(folder):

@@ -52,7 +52,7 @@ def write_examples(folder: Path) -> None:
         write_swing(folder)
 
 
-def write_swing(folder: Path, samples: int = 250, friction: float = 0.06) -> None:
+def write_swing(folder: Path, name: str = "SWING", samples: int = 250, friction: float = 0.06, seed: int = 0) -> None:
     """Write the manual's model for MuJoCo, and a recording of the same model with dry friction at its joint."""
     import mujoco
 
@@ -62,7 +62,7 @@ def write_swing(folder: Path, samples: int = 250, friction: float = 0.06) -> Non
     spec.joints[0].frictionloss = friction
     spec.option.timestep = 0.002
     model = spec.compile()
-    data, draw = mujoco.MjData(model), torch.Generator().manual_seed(0)
+    data, draw = mujoco.MjData(model), torch.Generator().manual_seed(seed)
     drive = 0.5 * torch.randn(samples // 25, generator=draw, dtype=torch.float64).repeat_interleave(25)
     angles = []
     for command in drive.tolist():
@@ -72,7 +72,7 @@ def write_swing(folder: Path, samples: int = 250, friction: float = 0.06) -> Non
             mujoco.mj_step(model, data)
     hinge = torch.tensor(angles, dtype=torch.float64) + 0.002 * torch.randn(samples, generator=draw)
     time = 0.02 * torch.arange(samples, dtype=torch.float64)
-    write_table(folder / "SWING.csv", {"time": time, "drive": drive, "hinge": hinge})
+    write_table(folder / f"{name}.csv", {"time": time, "drive": drive, "hinge": hinge})
 
 
 def vehicle_recording(samples: int = 1500, rate: float = 25.0) -> dict[str, Tensor]:

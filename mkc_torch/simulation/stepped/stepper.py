@@ -188,7 +188,8 @@ class Stepper(Dynamics):
 
 def _with_forces(recording: Recording, stepper: Stepper) -> Recording:
     """The recording with a column of zeros for each force."""
-    taken = [name for name in stepper.forces if name in recording]
+    # a prepared recording has them already
+    taken = [name for name in stepper.forces if name in recording and bool((recording[name] != 0.0).any())]
     if taken:
         raise SimulationError(
             f"{stepper.name}: the recording has a column `{taken[0]}`, the name of a force at which effects act; "

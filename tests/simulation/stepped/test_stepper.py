@@ -114,6 +114,12 @@ def test_each_run_has_its_own_start_and_forces_are_no_columns():
     np.testing.assert_allclose(prepared.simulated(theta, {})[30:, 0].numpy(), expected, atol=1e-10)
 
 
+def test_a_prepared_recording_is_prepared_again():
+    prepared = Steps().prepare(recording_of())
+    again = Steps().prepare(prepared.recording)
+    torch.testing.assert_close(again.residual(prepared.given, {}), prepared.residual(prepared.given, {}))
+
+
 def test_a_stepper_survives_pickling():
     prepared = Steps().prepare(recording_of())
     theta = prepared.given
@@ -138,7 +144,7 @@ class Diverging(Steps):
 @pytest.mark.parametrize(
     ("kind", "columns", "error", "message"),
     [
-        (Steps, {"moment": torch.zeros(60)}, SimulationError, "column `moment`, the name of a force"),
+        (Steps, {"moment": torch.ones(60)}, SimulationError, "column `moment`, the name of a force"),
         (
             type("Still", (Steps,), {"time_step": 0.0}),
             {},
