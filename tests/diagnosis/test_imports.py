@@ -14,7 +14,7 @@ import sys
 import torch
 
 from mkc_torch._support.dual_constants import dual_constants
-from mkc_torch.diagnosis.findings.finding import _curve
+from mkc_torch.diagnosis.findings.curve import curve_of_effect
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects import CATALOGUE, Context
 from mkc_torch.nonlinear import load_forward_mode
@@ -34,7 +34,7 @@ if "{what}" == "pole":
     slope = torch.func.vmap(lambda way: torch.func.jvp(dual_constants(change), (at,), (way,))[1])(torch.eye(3).double())
 else:
     (cubic,) = [effect for effect in CATALOGUE if effect.id == "cubic_nonlinearity"]
-    curve = _curve(Term(cubic, None, {{}}), torch.ones(3).double(), torch.eye(3).double(), context)
+    curve = curve_of_effect(Term(cubic, None, {{}}), torch.ones(3).double(), torch.eye(3).double(), context)
     slope = curve.band
 assert bool((slope != 0).any())
 print("torch._dynamo" in sys.modules)
