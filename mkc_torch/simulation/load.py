@@ -56,7 +56,7 @@ def load_simulation(source: str, fitted: Sequence[str] = ()) -> Simulation:
     if is_mujoco_model(source):
         return load_mjcf(source, fitted or None)
     if fitted:
-        raise SimulationFileError(f"--fit applies to a model of MuJoCo, and {source} is none; leave it out.")
+        raise SimulationFileError(f"--fit applies only to a model of MuJoCo, unlike {source}; leave it out.")
     path, name = _parts(source)
     if not path.is_file():
         raise SimulationFileError(f"{path}: there is no such file for --simulation {source}.")

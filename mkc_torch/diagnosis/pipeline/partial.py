@@ -241,7 +241,7 @@ def after_error(known: PartialResult, step: str, error: Exception, seconds: floa
     """
     try:
         result = cut_short(known, "internal error", seconds)
-    except Exception:
+    except Exception:  # of whatever kind: the first error is the cause, and is the one reported
         raise error from None
     return replace(result, warnings=(*result.warnings, failure(step, error)))
 

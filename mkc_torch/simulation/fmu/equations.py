@@ -19,6 +19,7 @@ from mkc_torch.simulation.fmu.description import Description, FmuError, FmuVaria
 from mkc_torch.simulation.fmu.evaluation import Evaluation
 from mkc_torch.simulation.foreign.evaluation import EvaluationPoints
 from mkc_torch.simulation.foreign.function import evaluated
+from mkc_torch.simulation.foreign.model_file import model_file
 from mkc_torch.simulation.parameter import SimulationError
 
 if TYPE_CHECKING:
@@ -136,11 +137,7 @@ def fmu_class(path: str | Path, file: str | None = None) -> type[FmuDynamics]:
         FmuError: the FMU cannot be used, or is for co-simulation only.
         ImportError: FMPy is not installed.
     """
-    place = Path(path)
-    if file is not None:
-        folder = Path(file).resolve().parent
-        places = [folder / path, folder / place.name, Path.cwd() / place.name]
-        place = next((path for path in places if path.is_file()), places[0])
+    place = model_file(path, file)
     described = read_description(place)
     if not described.exchange:
         raise FmuError(f"{place}: this FMU is for co-simulation only; export it for model exchange.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
@@ -67,7 +68,7 @@ def _size(values: Array) -> Array:
     return np.abs(values) if values.ndim == 1 else np.sqrt(np.square(values).mean(0))
 
 
-class CachedEvaluation:
+class CachedEvaluation(ABC):
     """A simulation outside torch as a function of time, states, inputs and parameters that returns rates or outputs.
 
     A derived class defines ``count``, ``fresh`` and ``columns``.
@@ -77,19 +78,19 @@ class CachedEvaluation:
         self._last: dict[bool, tuple[EvaluationPoints, Array]] = {}
         self._known: deque[tuple[Any, EvaluationPoints, Array]] = deque(maxlen=_REMEMBERED)
 
+    @abstractmethod
     def count(self, outputs: bool) -> int:
         """Number of rates, or of outputs."""
-        raise NotImplementedError
 
+    @abstractmethod
     def fresh(self, outputs: bool, rows: tuple[Array, Array, Array], parameters: Array) -> Array:
         """The rates or the outputs, (S, k), computed at times (S,), states (S, n) and inputs (S, m)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def columns(
         self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, base: Array
     ) -> Array:
         """Derivatives by each variable of a group, (S, k, size of the group); ``base`` are the values there."""
-        raise NotImplementedError
 
     def values(self, outputs: bool, at: EvaluationPoints) -> Array:
         """The rates of the states, or the outputs, (S, k); NaN where the simulation fails."""

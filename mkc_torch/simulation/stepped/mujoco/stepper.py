@@ -13,6 +13,7 @@ import numpy as np
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.correction import DynamicsCorrection
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+from mkc_torch.simulation.foreign.model_file import model_file
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.parameter import SimulationError
 from mkc_torch.simulation.stepped.mujoco.description import Description, described
@@ -119,12 +120,7 @@ def mjcf_class(path: str | Path, file: str | None = None, fitted: Sequence[str] 
         MjcfError: MuJoCo refuses the file, or the model has parts that cannot be diagnosed.
         ImportError: MuJoCo is not installed.
     """
-    place = Path(path)
-    if file is not None:
-        folder = Path(file).resolve().parent
-        places = [folder / path, folder / place.name, Path.cwd() / place.name]
-        place = next((path for path in places if path.is_file()), places[0])
-    return _class_of(described(place, fitted))
+    return _class_of(described(model_file(path, file), fitted))
 
 
 def is_of_a_model(kind: type) -> TypeGuard[type[MujocoStepper]]:
