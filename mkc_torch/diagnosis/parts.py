@@ -203,7 +203,8 @@ class Finding:
     ``times_plausible`` is its size as a multiple of the largest plausible size; None if that is unknown.
     ``shown_share`` is the share of the change of a sensor's vector that its compared length shows; None where each
     component is compared.
-    ``clearly_better`` is True if the open-loop fit without it is clearly less likely, whatever the error of its size.
+    ``clearly_better`` is True if the open-loop fit without it, with all others, is clearly less likely, whatever the
+    error of its size.
     ``p_value`` is that after the whole search; None in a quick look, which draws no surrogates.
     ``at_input`` has the size in the unit of an input, for an effect on a rate that one input alone moves.
     ``grade`` rates the finding; ``shape`` checks its named shape, None if not checked.

@@ -1,12 +1,15 @@
-"""Whether the fit without the last finding is clearly less likely, whatever the standard error of its size."""
+"""Whether the fit without a finding is clearly less likely, whatever the standard error of its size."""
 
 import types
 
 import pytest
 import torch
 
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.pipeline.build import _clearly_better
 from mkc_torch.diagnosis.settings import NamingSettings
+from tests.diagnosis.cart import DRAG, cart_terms, free_fit
 
 SAMPLES = 400
 
@@ -30,8 +33,16 @@ def test_the_last_finding_needs_a_gain_above_its_penalty(size, better):
     assert _clearly_better(fits(noise(0) + decay, noise(0)), 0, NamingSettings()) is better
 
 
-def test_the_gain_of_a_later_finding_does_not_count_for_an_earlier_finding():
-    decay = torch.exp(-(torch.arange(SAMPLES) % 100) / 10.0)
-    three = fits(noise(0) + 2.0 * decay, noise(0) + decay, noise(0))
-    assert not _clearly_better(three, 0, NamingSettings())
-    assert _clearly_better(three, 1, NamingSettings())
+@pytest.mark.parametrize("drag_first", [True, False])
+def test_each_finding_is_compared_with_the_model_of_all_others(drag_first):
+    alone = free_fit(DRAG)
+    (drag,), (force,) = (cart_terms(alone, name) for name in ("quadratic_drag", "constant_force"))
+    terms = (drag, force) if drag_first else (force, drag)
+
+    def fit(count):
+        model = JointModel(alone.model.prepared, terms[:count])
+        return fitted(model, torch.cat([alone.parameters, alone.parameters.new_zeros(count)]), alone.bound)
+
+    chain = [alone, fit(1), fit(2)]
+    answers = [_clearly_better(chain, number, NamingSettings()) for number in range(2)]
+    assert answers == [drag_first, not drag_first]  # the drag alone, at either place
