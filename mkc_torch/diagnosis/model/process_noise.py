@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,6 +22,8 @@ from mkc_torch.diagnosis.thresholds import HOLD
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.first_fit import multiple_shooting_start, with_strong_observer
 from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, most_likely_noise
+from mkc_torch.simulation.dynamics.noise_model import NoiseModel
+from mkc_torch.simulation.dynamics.noise_selection import SelectedNoise
 from mkc_torch.simulation.dynamics.other_starts import other_starts
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.protocol import PreparedSimulation
@@ -275,6 +278,41 @@ def with_noise_around(fit: FittedModel, declared: Mapping[str, float], settings:
     )
 
 
+def along_noise(
+    fit: FittedModel, noise: NoiseModel, declared: Mapping[str, float], settings: NoiseSettings
+) -> FittedModel | None:
+    """Return a fit under the process noise of a noise model, whose sizes are fitted again; None where that fails.
+
+    Args:
+        fit: in open loop.
+        noise: only its disturbances of rates are used.
+        declared: known standard deviations of the outputs' white noise.
+        settings: of the noise.
+    """
+    system = fit.model.prepared.dynamics
+    assert system is not None
+    each = noise.disturbances(system.disturbable, system.channels)
+    acting = tuple(disturbance for disturbance in each if disturbance.at_rate)
+    if not acting:
+        return None
+    unknown, sensor = (math.inf,) * len(acting), fit.residual.new_tensor(noise.sensor)
+    known = tuple(name in declared for name in system.channels)
+    given = SelectedNoise(acting, unknown, unknown, sensor, -math.inf, known)
+    theta, changes = fit.parameters[: fit.model.base], fit.model.changes(fit.parameters)
+    least, most = settings.disturbance_gain, settings.max_disturbances
+    sized = most_likely_noise(
+        system, theta, changes, fit.model.near, declared=declared, least=least, most=most, known=given
+    )
+    found = _under_noise(fit, sized, declared, settings)
+    return None if found is None or not has_process_noise(found[0]) else found[0]
+
+
+def under_its_noise(fit: FittedModel, declared: Mapping[str, float], settings: NoiseSettings) -> FittedModel:
+    """Return a fit along an observer, fitted again under the noise that is most likely along it; else the same fit."""
+    found = _under_noise(fit, estimate_noise(fit, declared, settings), declared, settings)
+    return fit if found is None else found[0]
+
+
 def refit_open_loop(fit: FittedModel) -> FittedModel | None:
     """Return the open-loop fit of the same joint model; None if that loses the recording."""
     return fit.open_loop
@@ -300,7 +338,8 @@ def _under_noise(
             break
         model = JointModel(fit.model.prepared.observed(noise.observer), fit.model.terms, fit.model.near)
         try:
-            fit = fitted(model, fit.parameters, fit.bound, graduate=False)
+            # the open-loop trajectory may be far from that along the observer
+            fit = fitted(model, fit.parameters, fit.bound, graduate=False, fresh=True)
         except NoFitError:
             break
         under, noise = noise, estimate_noise(fit, declared, settings, noise)

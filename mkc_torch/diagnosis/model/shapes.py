@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -353,7 +353,13 @@ def with_profiled_shape(fit: FittedModel) -> FittedModel:
         if not others:
             return fit
         known = fit.model.prepared, [fit.model.terms[-1]]
-        tried = [found for found in run_parallel([partial(_with_last, fit, term) for term in others], *known) if found]
+        tried = [
+            found
+            for found in run_parallel(
+                [partial(_with_terms, fit, [*fit.model.terms[:-1], term]) for term in others], *known
+            )
+            if found
+        ]
         leading = sorted(tried, key=lambda found: -found.log_likelihood)[:_LEADING]
         shaped = run_parallel([partial(shape_fitted, found) for found in leading], *known)
         best = max(shaped, key=lambda found: found.log_likelihood, default=fit)
@@ -363,8 +369,18 @@ def with_profiled_shape(fit: FittedModel) -> FittedModel:
     return fit
 
 
-def with_form_of_grid(fit: FittedModel, effort: Effort = FULL) -> FittedModel:
-    """Return the fit with the form of its last effect, such as a width, moved along its grid while it is more likely.
+def likelihood_of(fit: FittedModel) -> float:
+    """Return the log-likelihood of a fit, in nats."""
+    return fit.log_likelihood
+
+
+def with_form_of_grid(
+    fit: FittedModel,
+    effort: Effort = FULL,
+    value: Callable[[FittedModel], float] = likelihood_of,
+    number: int = -1,
+) -> FittedModel:
+    """Return the fit with the form of an effect, such as a width, moved along its grid while the fit's value grows.
 
     The search chooses a form by its linearised gain, which differs little between forms, but the joint fits can differ
     by more than those of two effects: dry friction whose sign changes too slowly loses to one that falls with speed.
@@ -372,26 +388,32 @@ def with_form_of_grid(fit: FittedModel, effort: Effort = FULL) -> FittedModel:
     Args:
         fit: with at least one effect, at its most likely parameters.
         effort: how far each fit goes.
+        value: of a fit, in nats, by which forms are compared.
+        number: of the effect; default the last.
     """
-    effect, prepared = fit.model.terms[-1].effect, fit.model.prepared
+    effect, prepared = fit.model.terms[number].effect, fit.model.prepared
     for name in set(effect.form_parameters) & set(effect.relative):
-        port = prepared.ports[fit.model.terms[-1].port]
+        port = prepared.ports[fit.model.terms[number].port]
         grid = sorted({absolute(effect, shape, port)[name] for shape in effect.shapes(prepared.time)})
         for steps in (-1, 1):
-            while (moved := _at_next(fit, name, grid, steps, effort)) is not None:
+            while (moved := _at_next(fit, number, name, grid, steps, effort)) is not None and (
+                value(moved) > value(fit) + _SETTLED_NATS
+            ):
                 fit = moved
     return fit
 
 
-def _at_next(fit: FittedModel, name: str, grid: Sequence[float], steps: int, effort: Effort) -> FittedModel | None:
-    """Refit with the next value of a number on its grid; None at the end, and where that is not more likely."""
-    term = fit.model.terms[-1]
+def _at_next(
+    fit: FittedModel, number: int, name: str, grid: Sequence[float], steps: int, effort: Effort
+) -> FittedModel | None:
+    """Refit with the next value of a number on its grid; None at the end, and without a finite trajectory."""
+    term = fit.model.terms[number]
     place = min(range(len(grid)), key=lambda k: abs(grid[k] - term.shape[name])) + steps
     if not 0 <= place < len(grid):
         return None
-    other = _with_last(fit, replace(term, shape={**term.shape, name: grid[place]}), effort)
-    more = other is not None and other.log_likelihood > fit.log_likelihood + _SETTLED_NATS
-    return other if more else None
+    terms = list(fit.model.terms)
+    terms[number] = replace(term, shape={**term.shape, name: grid[place]})
+    return _with_terms(fit, terms, effort)
 
 
 def _varied(fit: FittedModel) -> Iterator[Term]:
@@ -405,9 +427,10 @@ def _varied(fit: FittedModel) -> Iterator[Term]:
                 yield replace(term, shape={**term.shape, name: value})
 
 
-def _with_last(fit: FittedModel, term: Term, effort: Effort = FULL) -> FittedModel | None:
-    """Refit with another shape of the last effect; None if there is no finite trajectory."""
+def _with_terms(fit: FittedModel, terms: Sequence[Term], effort: Effort = FULL) -> FittedModel | None:
+    """Refit with other shapes of the effects; None if there is no finite trajectory."""
+    model = JointModel(fit.model.prepared, terms, fit.model.near)
     try:
-        return fitted(fit.model.with_last(term), fit.parameters, fit.bound, graduate=False, effort=effort)
+        return fitted(model, fit.parameters, fit.bound, graduate=False, effort=effort)
     except NoFitError:
         return None

@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.model.shapes import candidate_terms, shape_fitted, with
 from mkc_torch.diagnosis.model.suspect import suspect_id
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
 from mkc_torch.diagnosis.score import ScoreBasis, is_implausible, score, separation
+from mkc_torch.diagnosis.search.along_noise import add_along_noise
 from mkc_torch.diagnosis.search.candidate import Candidate, ModelKey, in_order, model_key
 from mkc_torch.diagnosis.search.in_words import leading
 from mkc_torch.diagnosis.search.move_fits import (
@@ -95,7 +96,7 @@ class BeamSearch:
             further: candidates that lead the screening, strongest first; they are tried first.
         """
         self._running = True
-        self._keep([Candidate(start, score(start, self.basis, self.settings), "")])
+        self.keep([Candidate(start, score(start, self.basis, self.settings), "")])
         terms = with_wide_grid(self.terms, start.model.prepared)
         expanded: set[ModelKey] = set()
         held: set[ModelKey] = set()
@@ -110,6 +111,7 @@ class BeamSearch:
             self._hold_best(held)
         self._improve(terms, further, expanded)
         self._under_noise()
+        add_along_noise(self, terms)
         self._running = False
         return self.best
 
@@ -122,15 +124,29 @@ class BeamSearch:
         """Whether a model's open-loop residual is clearly larger than that of a known model with a part of its effects.
 
         The root mean square counts every sample: a robust fit can score higher because it takes a stretch that the
-        simulation no longer follows for outliers.
+        simulation no longer follows for outliers. Under process noise a model may lose the open loop and nothing else,
+        if the recording is sensitive to small forces, as where a motor stops between the cogs.
         """
         own = {term.key for term in model.fit.model.terms}
         parts = [
-            other.log_size
+            other
             for other in self.models.values()
             if other is not model and {term.key for term in other.fit.model.terms} < own
         ]
-        return model.log_size > min(parts, default=math.inf) + math.log(LARGER)
+        return any(
+            model.log_size > other.log_size + math.log(LARGER) and not self._predicts_better(model, other)
+            for other in parts
+        )
+
+    def _predicts_better(self, model: Candidate, other: Candidate) -> bool:
+        """Whether a model under process noise of its states predicts clearly better over every horizon to the last."""
+        if model.score is None or other.score is None or not has_process_noise(model.fit):
+            return False
+        rates = len(self.basis.largest) - len(self.basis.span)
+        if not all(place < rates for place, _, _ in model.score.noise.components):
+            return False
+        gains = [a - b for a, b in zip(model.score.by_horizon, other.score.by_horizon, strict=True)][:-1]
+        return bool(gains) and min(gains) > self.settings.naming.separable * self.basis.kappa
 
     def beam(self) -> list[Candidate]:
         """Return the leading models, best first."""
@@ -155,12 +171,12 @@ class BeamSearch:
         """
         prepared = start.model.prepared
         orders = [tuple(groups), tuple(reversed(groups))] if thorough and len(groups) > 1 else [tuple(groups)]
-        works = [partial(self._scored, move, partial(self._added_in_turn, order, start)) for order in orders]
+        works = [partial(self.scored, move, partial(self._added_in_turn, order, start)) for order in orders]
         found = [model for model in run_parallel(works, prepared, self.terms, "model") if model is not None]
         best = max(found, key=lambda model: model.value)
         if thorough:
             others = [partial(fitted_reordered, best.fit, order) for order in in_other_orders(best.fit)]
-            works = [partial(self._scored, move, other) for other in others]
+            works = [partial(self.scored, move, other) for other in others]
             found = [model for model in run_parallel(works, prepared, self.terms, "model") if model is not None]
             best = max([best, *found], key=lambda model: model.value)
         best = self.under_noise(best)
@@ -178,9 +194,10 @@ class BeamSearch:
     def _fitted_with(
         self, fit: FittedModel, addition: Addition, others: Sequence[Callable[[], FittedModel | None]] = ()
     ) -> FittedModel:
-        return fitted_with(fit, addition, others, implausible=partial(is_implausible, basis=self.basis))
+        implausible = partial(is_implausible, basis=self.basis)
+        return fitted_with(fit, addition, others, implausible=implausible, value=self.value_of)
 
-    def _distinct(
+    def distinct(
         self, fit: FittedModel, addition: Addition, others: Sequence[Callable[[], FittedModel | None]] = ()
     ) -> FittedModel | None:
         """Return the fit with one more effect; None if what it is mistaken for cannot be separated from it."""
@@ -200,24 +217,24 @@ class BeamSearch:
             others = self._other_starts(fit, terms, further) if not have else {}
             for addition in self._chosen(additions(fit, terms, self.settings.noise), model, rank, further):
                 key = model_key([*fit.model.terms, addition.starts[0][0]])
-                work = partial(self._distinct, fit, addition, others.get(addition.key, ()))
-                works.append((key, f"add {self._id(addition.starts[0][0])}", work))
+                work = partial(self.distinct, fit, addition, others.get(addition.key, ()))
+                works.append((key, f"add {self.id_of(addition.starts[0][0])}", work))
         for number, term in enumerate(fit.model.terms):
             if have > 1:
                 rest = [other for other in fit.model.terms if other is not term]
-                works.append((model_key(rest), f"drop {self._id(term)}", partial(fitted_without, fit, number)))
+                works.append((model_key(rest), f"drop {self.id_of(term)}", partial(fitted_without, fit, number)))
             for other in special_cases(term, self.terms, fit.model.prepared):
                 if other.family in {known.family for known in fit.model.terms if known is not term}:
                     continue
                 rest = [*fit.model.terms[:number], *fit.model.terms[number + 1 :]]
-                move = f"exchange {self._id(term)} for {self._id(other)}"
+                move = f"exchange {self.id_of(term)} for {self.id_of(other)}"
                 group = self._all(other, term)
                 if other.family == term.family:
                     known = self.models.get(model_key(rest))
                     less = None if known is None else known.fit
                     work = partial(fitted_in_form, fit, number, group, self.settings.noise, less)
                 else:
-                    work = partial(fitted_exchanged, fit, number, group)
+                    work = partial(fitted_exchanged, fit, number, group, self.value_of)
                 works.append((model_key([*rest, other]), move, work))
         orders = in_other_orders(fit)
         works += [(model_key(o), "another order in series", partial(fitted_reordered, fit, o)) for o in orders]
@@ -234,11 +251,11 @@ class BeamSearch:
         held.add(best.key)
         other = self.with_best_hold(best)
         if other is not best:
-            self._keep([other])
+            self.keep([other])
             others = {key: model for key, model in self.models.items() if key and key not in held}
             held.update(others)
             works = [partial(self.with_best_hold, model) for model in others.values()]
-            self._keep(run_parallel(works, best.fit.model.prepared, self.terms, "model"))
+            self.keep(run_parallel(works, best.fit.model.prepared, self.terms, "model"))
 
     def _improve(self, terms: Sequence[Term], further: Sequence[Term], expanded: set[ModelKey]) -> None:
         """Expand the best model, and exchange its effects for others of the same channels, as long as that helps."""
@@ -258,13 +275,13 @@ class BeamSearch:
             if rest is None:
                 continue
             near = [other for other in terms if ports[other.port].channels == ports[term.port].channels]
-            found = one_form_each(additions(rest.fit, near, self.settings.noise), self._worth)
-            found = sorted(found, key=self._worth, reverse=True)
+            found = one_form_each(additions(rest.fit, near, self.settings.noise), self.worth)
+            found = sorted(found, key=self.worth, reverse=True)
             for addition in [other for other in found if other.key != term.key][:_EXCHANGES]:
                 other = addition.starts[0][0]
                 key = model_key([*rest.fit.model.terms, other])
-                move = f"exchange {self._id(term)} for {self._id(other)}"
-                works.append((key, move, partial(self._distinct, rest.fit, addition)))
+                move = f"exchange {self.id_of(term)} for {self.id_of(other)}"
+                works.append((key, move, partial(self.distinct, rest.fit, addition)))
         self._fit(works, fit, self.most_models)
 
     def _other_starts(
@@ -301,7 +318,7 @@ class BeamSearch:
             (model_key([other for other in fit.model.terms if other is not term]), number, term)
             for number, term in enumerate(fit.model.terms)
         ]
-        works = [(key, f"drop {self._id(term)}", partial(fitted_without, fit, number)) for key, number, term in rests]
+        works = [(key, f"drop {self.id_of(term)}", partial(fitted_without, fit, number)) for key, number, term in rests]
         self._fit(works, fit, len(self.models) + len(works))
         return [self.models[key] for key, _, _ in rests if key in self.models]
 
@@ -310,32 +327,32 @@ class BeamSearch:
     ) -> list[Addition]:
         """Return the additions to fit: the largest linear gains, less the price of the effect's numbers."""
         most = _ADDITIONS[min(rank, len(_ADDITIONS) - 1)]
-        found = one_form_each(found, self._worth)
-        ranked = sorted(found, key=self._worth, reverse=True)
+        found = one_form_each(found, self.worth)
+        ranked = sorted(found, key=self.worth, reverse=True)
         if model.fit.model.terms:
             own = {term.effect.id for term in model.fit.model.terms}
             # an effect at two places, as two vessels that overflow, may show only with both
             twins = [a for a in ranked if a.starts[0][0].effect.id in own][: _TWINS[min(rank, len(_TWINS) - 1)]]
             # far from the solution an open loop shows a lag or a delay less than the screening under process noise did
             led = [a for term in further for a in ranked if a.key == term.key][: _LEADERS[min(rank, len(_LEADERS) - 1)]]
-            ranked = [a for a in ranked if a.gain >= PAYS * self._price(*a.starts[0])]
+            ranked = [a for a in ranked if a.gain >= PAYS * self.price_of(*a.starts[0])]
             return list({a.key: a for a in [*ranked[:most], *twins, *led]}.values())
         first = [addition for term in further for addition in found if addition.key == term.key]
         first = list({addition.key: addition for addition in first}.values())
         others = [addition for addition in ranked if addition.key not in {a.key for a in first}]
         return [*first, *others[: max(most - len(first), most // 2)]]
 
-    def _worth(self, addition: Addition) -> float:
-        return addition.gain - self._price(*addition.starts[0])
+    def worth(self, addition: Addition) -> float:
+        return addition.gain - self.price_of(*addition.starts[0])
 
-    def _price(self, term: Term, size: torch.Tensor) -> float:
+    def price_of(self, term: Term, size: torch.Tensor) -> float:
         """Return the price of an effect next to a linear gain, a likelihood of one horizon."""
         naming = self.settings.naming
         form = naming.is_generalisation * term.effect.is_generalisation + naming.nameless * term.effect.is_curve
         numbers = len(size) + len(term.effect.fitted_shape)
         return self.basis.number / self.basis.kappa * numbers + self.basis.choice + form
 
-    def _id(self, term: Term) -> str:
+    def id_of(self, term: Term) -> str:
         return suspect_id(term, self.terms)
 
     def _all(self, term: Term, near: Term) -> tuple[Term, ...]:
@@ -352,17 +369,22 @@ class BeamSearch:
         for key, move, work in works:
             if key not in self.models and len(self.models) + len(new) < most:
                 new.setdefault(key, (move, work))
-        tried = [partial(self._scored, move, work) for move, work in new.values()]
+        tried = [partial(self.scored, move, work) for move, work in new.values()]
         if self._running:
             report_bound("model", len(self.models), self.most_models)
         found = run_parallel(tried, near.model.prepared, self.terms, "model")
-        self._keep([model for model in found if model is not None])
+        self.keep([model for model in found if model is not None])
 
-    def _scored(self, move: str, work: Callable[[], FittedModel | None]) -> Candidate | None:
+    def value_of(self, fit: FittedModel) -> float:
+        """Return the score of a fit; minus infinity where it loses the recording."""
+        found = score(fit, self.basis, self.settings)
+        return -math.inf if found is None else found.value
+
+    def scored(self, move: str, work: Callable[[], FittedModel | None]) -> Candidate | None:
         fit = work()
         return None if fit is None else Candidate(fit, score(fit, self.basis, self.settings), move)
 
-    def _keep(self, models: Iterable[Candidate]) -> None:
+    def keep(self, models: Iterable[Candidate]) -> None:
         for model in models:
             self.models[model.key] = model
         if self._running and len(self.models) > 1:
@@ -372,7 +394,7 @@ class BeamSearch:
         """Fit the leading models under their process noise too; keep the fit that scores higher."""
         leading = sorted(self.models.values(), key=lambda model: -model.value)[:_NOISY]
         works = [partial(self.under_noise, model) for model in leading]
-        self._keep(run_parallel(works, leading[0].fit.model.prepared, self.terms, "model"))
+        self.keep(run_parallel(works, leading[0].fit.model.prepared, self.terms, "model"))
 
     def under_noise(self, model: Candidate, less: float = 0.0) -> Candidate:
         """Return a model fitted under its process noise, unless that scores lower by more than ``less`` nats."""

@@ -1,0 +1,76 @@
+"""Effects that are added along the process noise of a model, where an open loop is too sensitive for them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.process_noise import along_noise, has_only_drift, has_process_noise, under_its_noise
+from mkc_torch.diagnosis.model.shapes import with_form_of_grid
+from mkc_torch.diagnosis.model.term import Term, run_parallel
+from mkc_torch.diagnosis.search.candidate import Candidate, model_key
+from mkc_torch.diagnosis.search.moves import Addition, additions, one_form_each
+from mkc_torch.diagnosis.thresholds import PAYS
+
+if TYPE_CHECKING:
+    from mkc_torch.diagnosis.search.beam import BeamSearch
+
+_TRIED = 3
+"""Number of effects that are tried in addition to the best model."""
+
+
+def add_along_noise(beam: BeamSearch, terms: Sequence[Term]) -> None:
+    """Add effects to the best model of a beam along its process noise, as long as that raises the score.
+
+    A trajectory that an observer corrects stays near the recording, so that the linear gain of an effect holds where
+    a small force decides which way an open loop takes.
+
+    Args:
+        beam: the models so far; receives the new ones.
+        terms: the candidates.
+    """
+    best = None
+    while best is not beam.best and len(beam.best.fit.model.terms) < beam.most_terms:
+        best = beam.best
+        if any(term.effect.is_curve for term in best.fit.model.terms):
+            return
+        fit = _along_noise(best, beam)
+        if fit is None:
+            return
+        found = sorted(one_form_each(additions(fit, terms, beam.settings.noise), beam.worth), key=beam.worth)
+        pays = [one for one in reversed(found) if one.gain >= PAYS * beam.price_of(*one.starts[0])]
+        works = [
+            partial(beam.scored, f"add {beam.id_of(one.starts[0][0])} along the noise", partial(_with, beam, fit, one))
+            for one in pays[:_TRIED]
+        ]
+        new = run_parallel(works, fit.model.prepared, beam.terms, "model")
+        beam.keep([model for model in new if model is not None and model.value > _known(model, beam)])
+
+
+def _along_noise(model: Candidate, beam: BeamSearch) -> FittedModel | None:
+    """Return a model's fit along its process noise; None where its noise has none of a state."""
+    fit = model.fit
+    if has_process_noise(fit):
+        return None if has_only_drift(fit) else fit
+    if fit.model.open_loop_only or model.score is None:
+        return None
+    return along_noise(fit, model.score.noise, beam.declared, beam.settings.noise)
+
+
+def _with(beam: BeamSearch, fit: FittedModel, addition: Addition) -> FittedModel | None:
+    """Return the fit with one more effect, under the noise that is left with it, at the best form of each effect."""
+    found = beam.distinct(fit, addition)
+    if found is None:
+        return None
+    found = under_its_noise(found, beam.declared, beam.settings.noise)
+    for number in range(len(found.model.terms)):
+        found = with_form_of_grid(found, value=beam.value_of, number=number)
+    return found
+
+
+def _known(model: Candidate, beam: BeamSearch) -> float:
+    """Return the score of the known model with the same effects."""
+    known = beam.models.get(model_key(model.fit.model.terms))
+    return -float("inf") if known is None else known.value
