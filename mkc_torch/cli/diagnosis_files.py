@@ -188,9 +188,13 @@ def write_diagnosis(
         made["model.json"] = lambda _: model.to_json()
         made["corrected.py"] = lambda _: model.to_python(folder=folder)
         made["corrected.xml"] = lambda _: model.to_mjcf()[0]
+    changes, warnings = (
+        (None, ()) if model is None else _text_of("the changes of the model", lambda _: model.mjcf_changes(), diagnosis)
+    )
+    diagnosis = replace(diagnosis, warnings=(*diagnosis.warnings, *warnings)) if warnings else diagnosis
     # the files with warnings come last
     if report:
-        made["report.html"] = lambda d: diagnosis_report(d, note=note, paths=paths)
+        made["report.html"] = lambda d: diagnosis_report(d, note=note, paths=paths, changes=changes or "")
     made["diagnosis.json"] = diagnosis_to_json
     texts: dict[str, str] = {}
     for name, text_of in made.items():

@@ -141,6 +141,10 @@ class CorrectingModel(nn.Module):
     def to_mjcf(self) -> tuple[str, tuple[str, ...]]:
         """Return a MuJoCo model's file with the findings, and the findings that it cannot express."""
 
+    @abstractmethod
+    def mjcf_changes(self) -> str:
+        """Return what :meth:`to_mjcf` changes in a MuJoCo model's file, as a unified diff."""
+
 
 VERDICT_SENTENCES: dict[Verdict, str] = {
     "unfit": "The simulation does not fit the recording.",

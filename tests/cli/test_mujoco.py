@@ -34,6 +34,8 @@ def test_hidden_dry_friction_is_named_at_the_joint_and_written_into_the_model(fo
     mkc("diagnose", "SWING.csv", "--simulation", "swing.xml", "--output", "results", "--quick")
     written = folder / "results" / "SWING"
     assert "entry of hinge_force" in (written / "diagnosis.json").read_text()
+    page = (written / "report.html").read_text()
+    assert re.search('<span class="added">[+] .*frictionloss=', page)  # the page shows what corrected.xml changes
     new = load_mjcf(written / "corrected.xml").parameters
     assert new["hinge_frictionloss"].value == pytest.approx(FRICTION, abs=0.02)
     applied = mkc("apply", written / "model.json", "SWING.csv", "--simulation", "swing.xml", "--output", "sim.csv")

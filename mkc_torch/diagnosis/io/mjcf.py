@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -45,3 +46,21 @@ def mjcf_source(
     only = f" Only corrected.py has: {'; '.join(others)}." if others else ""
     note = f"With the findings of mkc diagnose.{only}".replace("--", "-")  # a comment cannot hold two hyphens
     return corrected_xml(system.description, values, added, note), tuple(others)
+
+
+def mjcf_changes(system: MujocoStepper, text: str) -> str:
+    """Return the lines of a model's file that differ in another, as a unified diff.
+
+    Both are as MuJoCo writes them, so that only numbers and attributes differ, not the order or the spaces.
+
+    Args:
+        system: the diagnosed model.
+        text: the other file.
+    """
+    from mkc_torch.simulation.stepped.mujoco.corrected import corrected_xml
+
+    plain = corrected_xml(system.description, {}, {})
+    lines = difflib.unified_diff(
+        plain.splitlines(), text.splitlines(), system.description.path.name, "corrected.xml", lineterm="", n=1
+    )
+    return "\n".join(lines)

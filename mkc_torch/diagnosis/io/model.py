@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from mkc_torch.diagnosis.declared import checked_input_hold
-from mkc_torch.diagnosis.io.mjcf import mjcf_source
+from mkc_torch.diagnosis.io.mjcf import mjcf_changes, mjcf_source
 from mkc_torch.diagnosis.io.python_source import SourceError, python_source
 from mkc_torch.diagnosis.io.selected_sizes import refuse_unselected, selected, without_runs
 from mkc_torch.diagnosis.io.term_entry import term_entry
@@ -245,6 +245,16 @@ class DiagnosedModel(CorrectingModel):
         if not isinstance(self.source, MujocoStepper):
             raise SourceError(f'Only a MuJoCo model can be exported as MJCF, but the model is of "{self.simulation}".')
         return mjcf_source(self.source, self.theta.tolist(), self.terms, tuple(self.gammas))
+
+    def mjcf_changes(self) -> str:
+        """Return what :meth:`to_mjcf` changes in a MuJoCo model's file, as a unified diff.
+
+        Raises:
+            SourceError: the simulation is no MuJoCo model.
+        """
+        text, _ = self.to_mjcf()
+        assert isinstance(self.source, MujocoStepper)
+        return mjcf_changes(self.source, text)
 
     @staticmethod
     def from_json(

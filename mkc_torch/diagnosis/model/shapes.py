@@ -353,13 +353,8 @@ def with_profiled_shape(fit: FittedModel) -> FittedModel:
         if not others:
             return fit
         known = fit.model.prepared, [fit.model.terms[-1]]
-        tried = [
-            found
-            for found in run_parallel(
-                [partial(_with_terms, fit, [*fit.model.terms[:-1], term]) for term in others], *known
-            )
-            if found
-        ]
+        works = [partial(_with_terms, fit, [*fit.model.terms[:-1], term]) for term in others]
+        tried = [found for found in run_parallel(works, *known) if found]
         leading = sorted(tried, key=lambda found: -found.log_likelihood)[:_LEADING]
         shaped = run_parallel([partial(shape_fitted, found) for found in leading], *known)
         best = max(shaped, key=lambda found: found.log_likelihood, default=fit)

@@ -53,13 +53,16 @@ class Cell(NamedTuple):
     color: str
 
 
-def diagnosis_report(diagnosis: Diagnosis, *, note: str = "", paths: verdict.RunPaths | None = None) -> str:
+def diagnosis_report(
+    diagnosis: Diagnosis, *, note: str = "", paths: verdict.RunPaths | None = None, changes: str = ""
+) -> str:
     """Return the page of a diagnosis.
 
     Args:
         diagnosis: what was found.
         note: a sentence for the top of the page, for example that the data are simulated.
         paths: paths of the run, for the proposed command.
+        changes: what the corrected file of a model changes, as a unified diff; empty to leave it out.
 
     Returns:
         HTML with inline figures.
@@ -81,6 +84,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "", paths: verdict.Run
         d=d,
         note=note,
         paths=paths,
+        changes=changes,
         say=findings,
         evidence=evidence,
         decided=decisions,

@@ -151,6 +151,21 @@ def test_a_finding_that_mjcf_cannot_express_is_named_in_the_file(two_links):
     assert f"Only corrected.py has: {others[0]}." in text
 
 
+def test_the_changes_of_a_corrected_model_are_its_numbers_alone(two_links):
+    from mkc_torch.diagnosis.io.mjcf import mjcf_changes
+    from mkc_torch.simulation.stepped.mujoco.corrected import corrected_xml
+
+    system = load_mjcf(two_links)
+    assert mjcf_changes(system, corrected_xml(system.description, {}, {})) == ""
+    text = corrected_xml(system.description, {}, {("elbow", "frictionloss"): 0.07})
+    lines = mjcf_changes(system, text).splitlines()
+    assert lines[:2] == [f"--- {two_links.name}", "+++ corrected.xml"]
+    removed, added = ([line for line in lines[2:] if line[0] == sign] for sign in "-+")
+    assert len(removed) == len(added) == 1
+    assert 'frictionloss="0.07"' in added[0]
+    assert added[0][1:].replace(' frictionloss="0.07"', "") == removed[0][1:]
+
+
 def test_the_example_recording_has_the_columns_that_a_diagnosis_needs(two_links):
     from mkc_torch.simulation.stepped.mujoco.example import example_recording
 
