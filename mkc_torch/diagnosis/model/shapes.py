@@ -390,11 +390,13 @@ def with_form_of_grid(
     for name in set(effect.form_parameters) & set(effect.relative):
         port = prepared.ports[fit.model.terms[number].port]
         grid = sorted({absolute(effect, shape, port)[name] for shape in effect.shapes(prepared.time)})
+        known = value(fit) if len(grid) > 1 else 0.0
         for steps in (-1, 1):
-            while (moved := _at_next(fit, number, name, grid, steps, effort)) is not None and (
-                value(moved) > value(fit) + _SETTLED_NATS
-            ):
-                fit = moved
+            while (moved := _at_next(fit, number, name, grid, steps, effort)) is not None:
+                other = value(moved)
+                if not other > known + _SETTLED_NATS:
+                    break
+                fit, known = moved, other
     return fit
 
 

@@ -17,8 +17,8 @@ from mkc_torch.diagnosis.thresholds import PAYS
 if TYPE_CHECKING:
     from mkc_torch.diagnosis.search.beam import BeamSearch
 
-_TRIED = 3
-"""Number of effects that are tried in addition to the best model."""
+TRIED = 3
+"""Number of effects that are tried in addition to the best model; the search keeps as many models for them."""
 
 
 def add_along_noise(beam: BeamSearch, terms: Sequence[Term]) -> None:
@@ -43,7 +43,7 @@ def add_along_noise(beam: BeamSearch, terms: Sequence[Term]) -> None:
         pays = [one for one in reversed(found) if one.gain >= PAYS * beam.price_of(*one.starts[0])]
         works = [
             partial(beam.scored, f"add {beam.id_of(one.starts[0][0])} along the noise", partial(_with, beam, fit, one))
-            for one in pays[:_TRIED]
+            for one in pays[: min(TRIED, beam.most_models - len(beam.models))]
         ]
         new = run_parallel(works, fit.model.prepared, beam.terms, "model")
         beam.keep([model for model in new if model is not None and model.value > _known(model, beam)])

@@ -15,9 +15,9 @@ from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise, has_
 from mkc_torch.diagnosis.model.shapes import candidate_terms, shape_fitted, with_profiled_shape
 from mkc_torch.diagnosis.model.suspect import suspect_id
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
-from mkc_torch.diagnosis.score import ScoreBasis, is_implausible, score, separation
-from mkc_torch.diagnosis.search.along_noise import add_along_noise
-from mkc_torch.diagnosis.search.candidate import Candidate, ModelKey, in_order, model_key
+from mkc_torch.diagnosis.score import Score, ScoreBasis, is_implausible, score, separation
+from mkc_torch.diagnosis.search.along_noise import TRIED, add_along_noise
+from mkc_torch.diagnosis.search.candidate import Candidate, ModelKey, in_order, model_key, predicts_better
 from mkc_torch.diagnosis.search.in_words import leading
 from mkc_torch.diagnosis.search.move_fits import (
     POLISHED,
@@ -87,6 +87,7 @@ class BeamSearch:
     noisy: FittedModel | None = None
     fixed: Mapping[str, str] = field(default_factory=dict)
     _running: bool = False
+    _scores: dict[int, tuple[FittedModel, Score | None]] = field(default_factory=dict)
 
     def run(self, start: FittedModel, further: Sequence[Term] = ()) -> Candidate:
         """Search from the simulation alone; return the model with the highest score.
@@ -124,29 +125,20 @@ class BeamSearch:
         """Whether a model's open-loop residual is clearly larger than that of a known model with a part of its effects.
 
         The root mean square counts every sample: a robust fit can score higher because it takes a stretch that the
-        simulation no longer follows for outliers. Under process noise a model may lose the open loop and nothing else,
-        if the recording is sensitive to small forces, as where a motor stops between the cogs.
+        simulation no longer follows for outliers. A recording that is sensitive to small forces may lose it alone.
         """
         own = {term.key for term in model.fit.model.terms}
+        rates = len(self.basis.largest) - len(self.basis.span)
+        least = self.settings.naming.separable * self.basis.kappa
         parts = [
             other
             for other in self.models.values()
             if other is not model and {term.key for term in other.fit.model.terms} < own
         ]
         return any(
-            model.log_size > other.log_size + math.log(LARGER) and not self._predicts_better(model, other)
+            model.log_size > other.log_size + math.log(LARGER) and not predicts_better(model, other, rates, least)
             for other in parts
         )
-
-    def _predicts_better(self, model: Candidate, other: Candidate) -> bool:
-        """Whether a model under process noise of its states predicts clearly better over every horizon to the last."""
-        if model.score is None or other.score is None or not has_process_noise(model.fit):
-            return False
-        rates = len(self.basis.largest) - len(self.basis.span)
-        if not all(place < rates for place, _, _ in model.score.noise.components):
-            return False
-        gains = [a - b for a, b in zip(model.score.by_horizon, other.score.by_horizon, strict=True)][:-1]
-        return bool(gains) and min(gains) > self.settings.naming.separable * self.basis.kappa
 
     def beam(self) -> list[Candidate]:
         """Return the leading models, best first."""
@@ -259,15 +251,15 @@ class BeamSearch:
 
     def _improve(self, terms: Sequence[Term], further: Sequence[Term], expanded: set[ModelKey]) -> None:
         """Expand the best model, and exchange its effects for others of the same channels, as long as that helps."""
-        best = None
-        while best is not self.best and self.best.fit.model.terms and len(self.models) < self.most_models:
+        best, most = None, self.most_models - (TRIED if self.most_models > 10 * TRIED else 0)
+        while best is not self.best and self.best.fit.model.terms and len(self.models) < most:
             best = self.best
             if best.key not in expanded:
                 expanded.add(best.key)
-                self._expand(best, 0, terms, further, self.most_models)
-            self._exchange(best, terms)
+                self._expand(best, 0, terms, further, most)
+            self._exchange(best, terms, most)
 
-    def _exchange(self, model: Candidate, terms: Sequence[Term]) -> None:
+    def _exchange(self, model: Candidate, terms: Sequence[Term], most: int) -> None:
         """Fit the model with another effect of the same channels in place of each of its effects."""
         fit, ports, works = model.fit, model.fit.model.prepared.ports, []
         for term in fit.model.terms:
@@ -282,7 +274,7 @@ class BeamSearch:
                 key = model_key([*rest.fit.model.terms, other])
                 move = f"exchange {self.id_of(term)} for {self.id_of(other)}"
                 works.append((key, move, partial(self.distinct, rest.fit, addition)))
-        self._fit(works, fit, self.most_models)
+        self._fit(works, fit, most)
 
     def _other_starts(
         self, fit: FittedModel, terms: Sequence[Term], further: Sequence[Term]
@@ -375,14 +367,22 @@ class BeamSearch:
         found = run_parallel(tried, near.model.prepared, self.terms, "model")
         self.keep([model for model in found if model is not None])
 
+    def score_of(self, fit: FittedModel) -> Score | None:
+        """Return the score of a fit; it is computed once."""
+        known = self._scores.get(id(fit))
+        if known is None or known[0] is not fit:
+            known = self._scores[id(fit)] = fit, score(fit, self.basis, self.settings)
+        return known[1]
+
     def value_of(self, fit: FittedModel) -> float:
-        """Return the score of a fit; minus infinity where it loses the recording."""
-        found = score(fit, self.basis, self.settings)
+        """Return the score of a fit in nats; minus infinity where it loses the recording."""
+        found = self.score_of(fit)
         return -math.inf if found is None else found.value
 
     def scored(self, move: str, work: Callable[[], FittedModel | None]) -> Candidate | None:
+        self._scores.clear()
         fit = work()
-        return None if fit is None else Candidate(fit, score(fit, self.basis, self.settings), move)
+        return None if fit is None else Candidate(fit, self.score_of(fit), move)
 
     def keep(self, models: Iterable[Candidate]) -> None:
         for model in models:

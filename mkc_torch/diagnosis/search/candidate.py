@@ -85,3 +85,19 @@ def in_order(model: Candidate, terms: Sequence[Term]) -> Candidate:
     ordered = JointModel(fit.model.prepared, [fit.model.terms[number] for number in order], fit.model.near)
     parameters = torch.cat([fit.parameters[: fit.model.base], *[gammas[number] for number in order]])
     return replace(model, fit=replace(fit, model=ordered, parameters=parameters))
+
+
+def predicts_better(model: Candidate, other: Candidate, rates: int, least: float) -> bool:
+    """Whether a model under process noise of states alone predicts better over every horizon but the free run.
+
+    Args:
+        model, other: the models.
+        rates: number of rates that a disturbance can act on; a larger place is the drift of an output.
+        least: nats that it has to gain over each horizon.
+    """
+    if model.fit.model.prepared.observer is None or model.score is None or other.score is None:
+        return False
+    if not all(place < rates for place, _, _ in model.score.noise.components):
+        return False
+    gains = [own - behind for own, behind in zip(model.score.by_horizon, other.score.by_horizon, strict=True)]
+    return len(gains) > 1 and min(gains[:-1]) > least

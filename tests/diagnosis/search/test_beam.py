@@ -87,7 +87,8 @@ def test_every_model_is_fitted_and_scored_once_for_each_hold(monkeypatch):
     scored = []
 
     def counted(fit, *others):
-        scored.append((model_key(fit.model.terms), tuple(fit.model.prepared.input_hold.items())))
+        forms = tuple(tuple(term.shape.items()) for term in fit.model.terms)
+        scored.append((model_key(fit.model.terms), (tuple(fit.model.prepared.input_hold.items()), forms)))
         return score(fit, *others)
 
     def refused(*_):
@@ -151,14 +152,18 @@ def test_an_implausible_size_has_no_score(factor, scored):
     assert (candidate.value > -float("inf")) is scored
 
 
-def stub(effects, value, residual):
+def stub(effects, value, residual, by_horizon=(0.0, 0.0, 0.0), *, observer=None, place=0):
+    """Return a candidate with a residual and a score of three horizons; ``place`` is that of its disturbance."""
     terms = tuple(SimpleNamespace(key=(name, (), "rate of speed"), first=False) for name in effects)
-    fit = SimpleNamespace(model=SimpleNamespace(terms=terms), open_loop=SimpleNamespace(residual=residual))
-    return Candidate(fit, SimpleNamespace(value=value), "")
+    model = SimpleNamespace(terms=terms, prepared=SimpleNamespace(observer=observer))
+    fit = SimpleNamespace(model=model, open_loop=SimpleNamespace(residual=residual))
+    noise = SimpleNamespace(components=((place, 1.0, 0.0),))
+    return Candidate(fit, SimpleNamespace(value=value, by_horizon=by_horizon, noise=noise), "")
 
 
 def beam_with(*models):
-    return BeamSearch((), None, SETTINGS, {}, {model.key: model for model in models})
+    basis = SimpleNamespace(largest=[1.0, 1.0], span=[1.0], kappa=1.0)  # one rate and one output
+    return BeamSearch((), basis, SETTINGS, {}, {model.key: model for model in models})
 
 
 @pytest.mark.parametrize(("ratio", "larger"), [(0.98 * LARGER, False), (1.02 * LARGER, True)])
@@ -183,6 +188,24 @@ def test_a_residual_is_compared_with_those_of_models_with_a_part_of_the_effects(
     assert not beam.enlarges(lag)  # drag is not a part of it
     assert beam.enlarges(both)
     assert beam.best is drag
+
+
+@pytest.mark.parametrize(
+    ("gains", "observer", "place", "is_best"),
+    [
+        ((9.0, 9.0, -50.0), "along it", 0, True),
+        ((9.0, 1.0, 50.0), "along it", 0, False),  # a gain over one horizon is not clear
+        ((9.0, 9.0, -50.0), None, 0, False),  # in open loop the free run is what counts
+        ((9.0, 9.0, -50.0), "along it", 1, False),  # a drift of the output predicts a lost stretch
+    ],
+)
+def test_a_model_of_a_sensitive_recording_may_lose_the_free_run_alone(gains, observer, place, is_best):
+    residual = torch.ones(50, 1, dtype=torch.float64)
+    alone = stub((), 0.0, residual)
+    cogs = stub(("cogs",), 10.0, 3.0 * residual, gains, observer=observer, place=place)
+    beam = beam_with(alone, cogs)
+    assert beam.enlarges(cogs) is not is_best
+    assert beam.best is (cogs if is_best else alone)
 
 
 def test_a_model_that_loses_the_recording_is_not_the_best():
