@@ -251,7 +251,7 @@ class BeamSearch:
 
     def _improve(self, terms: Sequence[Term], further: Sequence[Term], expanded: set[ModelKey]) -> None:
         """Expand the best model, and exchange its effects for others of the same channels, as long as that helps."""
-        best, most = None, self.most_models - (TRIED if self.most_models > 10 * TRIED else 0)
+        best, most = None, self.most_models - (2 * TRIED if self.most_models > 10 * TRIED else 0)
         while best is not self.best and self.best.fit.model.terms and len(self.models) < most:
             best = self.best
             if best.key not in expanded:
