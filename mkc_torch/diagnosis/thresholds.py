@@ -43,11 +43,12 @@ LEAST_WIDTH = 3
 MOST_TERMS = 5
 """Largest number of effects of a model."""
 
-MOST_MODELS = 60
+MOST_MODELS = 66
 """Largest number of models of a recording. By judgement: more cost time."""
 
-IMPROVING = 0.25
-"""Share of them that is kept for improving the best model of the beam. By judgement, on an arm with a propeller."""
+IMPROVING = 1.0 / 3.0
+"""Share of them that is kept for improving the best models of the beam, the last six for effects along the noise. By
+judgement, on an arm with a propeller."""
 
 PAYS = 0.5
 """Share of its price that an addition to a model with effects has to gain in the linearised model. By judgement, on an

@@ -17,7 +17,7 @@ from mkc_torch.diagnosis.model.suspect import suspect_id
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
 from mkc_torch.diagnosis.score import Score, ScoreBasis, is_implausible, score, separation
 from mkc_torch.diagnosis.search.along_noise import TRIED, add_along_noise
-from mkc_torch.diagnosis.search.candidate import Candidate, ModelKey, in_order, model_key, predicts_better
+from mkc_torch.diagnosis.search.candidate import Candidate, ModelKey, in_order, model_key, place_of, predicts_better
 from mkc_torch.diagnosis.search.in_words import leading
 from mkc_torch.diagnosis.search.move_fits import (
     POLISHED,
@@ -107,8 +107,9 @@ class BeamSearch:
             if not waiting:
                 break
             for rank, model in waiting:
-                expanded.add(model.key)
-                self._expand(model, rank, terms, further, most)
+                if len(self.models) < most:
+                    expanded.add(model.key)
+                    self._expand(model, rank, terms, further, most)
             self._hold_best(held)
         self._improve(terms, further, expanded)
         self._under_noise()
@@ -130,11 +131,7 @@ class BeamSearch:
         own = {term.key for term in model.fit.model.terms}
         rates = len(self.basis.largest) - len(self.basis.span)
         least = self.settings.naming.separable * self.basis.kappa
-        parts = [
-            other
-            for other in self.models.values()
-            if other is not model and {term.key for term in other.fit.model.terms} < own
-        ]
+        parts = [other for other in self.models.values() if {term.key for term in other.fit.model.terms} < own]
         return any(
             model.log_size > other.log_size + math.log(LARGER) and not predicts_better(model, other, rates, least)
             for other in parts
@@ -172,7 +169,7 @@ class BeamSearch:
             found = [model for model in run_parallel(works, prepared, self.terms, "model") if model is not None]
             best = max([best, *found], key=lambda model: model.value)
         best = self.under_noise(best)
-        return in_order(best, sorted(best.fit.model.terms, key=lambda term: _place_of(term, groups)))
+        return in_order(best, sorted(best.fit.model.terms, key=lambda term: place_of(term, groups)))
 
     def _added_in_turn(self, groups: Sequence[Sequence[Term]], start: FittedModel) -> FittedModel:
         """Return a fit with more effects, added one after the other."""
@@ -250,14 +247,19 @@ class BeamSearch:
             self.keep(run_parallel(works, best.fit.model.prepared, self.terms, "model"))
 
     def _improve(self, terms: Sequence[Term], further: Sequence[Term], expanded: set[ModelKey]) -> None:
-        """Expand the best model, and exchange its effects for others of the same channels, as long as that helps."""
+        """Expand the models near the best, and exchange the best's effects for others of the same channels."""
         best, most = None, self.most_models - (2 * TRIED if self.most_models > 10 * TRIED else 0)
-        while best is not self.best and self.best.fit.model.terms and len(self.models) < most:
-            best = self.best
-            if best.key not in expanded:
-                expanded.add(best.key)
-                self._expand(best, 0, terms, further, most)
-            self._exchange(best, terms, most)
+        while self.best.fit.model.terms and len(self.models) < most:
+            near = self.best.value - self.settings.naming.separable * self.basis.kappa
+            waiting = [model for model in self.beam() if model.value >= near and model.key not in expanded]
+            if waiting:
+                expanded.add(waiting[0].key)
+                self._expand(waiting[0], 0, terms, further, most)
+            elif best is self.best:
+                return
+            else:
+                best = self.best
+                self._exchange(best, terms, most)
 
     def _exchange(self, model: Candidate, terms: Sequence[Term], most: int) -> None:
         """Fit the model with another effect of the same channels in place of each of its effects."""
@@ -444,7 +446,3 @@ class BeamSearch:
             return model
         other = replace(model, fit=fit, score=score(fit, self.basis, self.settings))
         return other if other.value > model.value - less else model
-
-
-def _place_of(term: Term, groups: Sequence[Sequence[Term]]) -> int:
-    return next(number for number, group in enumerate(groups) if term.key in {other.key for other in group})

@@ -101,3 +101,8 @@ def predicts_better(model: Candidate, other: Candidate, rates: int, least: float
         return False
     gains = [own - behind for own, behind in zip(model.score.by_horizon, other.score.by_horizon, strict=True)]
     return len(gains) > 1 and min(gains[:-1]) > least
+
+
+def place_of(term: Term, groups: Sequence[Sequence[Term]]) -> int:
+    """Return the number of the group that has the effect of a term."""
+    return next(number for number, group in enumerate(groups) if term.key in {other.key for other in group})

@@ -30,10 +30,6 @@ _CELLS = 1 << 22
 """Numbers of the covariances that are held at once: 32 MB, a few times over."""
 
 
-_SQUARABLE = 1e150
-"""Absolute values below which a square is finite."""
-
-
 def horizons_of(flow: Flow) -> tuple[int, ...]:
     """The horizons 1, 4, 16, … in samples, up to a tenth of the shortest run, and last the free run of the longest."""
     ends = np.flatnonzero(np.concatenate([flow.step <= 0, [True]]))
@@ -90,8 +86,8 @@ def _of_block(
     flow: Flow, noises: Sequence[NoiseModel], horizons: Sequence[int], span: Float[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, "B H"], Float[np.ndarray, " B"]]:
     found = _ahead(flow, filter_models(flow, noises), horizons)
-    finite = ((np.abs(found.standard) < _SQUARABLE) & np.isfinite(found.log_spread)).all((0, 1, 3))
-    if not finite.all():
+    if not np.isfinite(found.standard).all():
+        finite = np.isfinite(found.standard).all((0, 1, 3))
         values, scales = np.full((len(noises), len(horizons)), -np.inf), np.ones(len(noises))
         if finite.any():
             kept = [noise for noise, good in zip(noises, finite, strict=True) if good]

@@ -44,6 +44,9 @@ _FAR = 700.0
 _REACH = 20.0
 """Smallest range of the outliers' uniform density, in robust standard deviations."""
 
+_LOST = 1e100
+"""Largest absolute standardised innovation; its square is finite."""
+
 
 @dataclass(frozen=True, eq=False)
 class Flow:
@@ -369,7 +372,8 @@ def robust_likelihood(
     """
     B = found.standard.shape[2]
     used = counts > 0
-    square = np.square(found.standard.swapaxes(2, 3)[used].T)  # (B, samples that count)
+    # a model that loses the recording has innovations whose squares are infinite
+    square = np.square(np.clip(found.standard.swapaxes(2, 3)[used].T, -_LOST, _LOST))  # (B, samples that count)
     spread = found.log_spread.swapaxes(2, 3)[used].T
     tail = math.log(math.sqrt(0.5 * math.pi) * OUTLIERS / (1.0 - OUTLIERS)) - np.log(reach)
     # log ratio of the outliers' density to the normal density at its mode
