@@ -113,8 +113,10 @@ def _frozen(
     alone = turned.shape[-1] != values.shape[-1]
     usual = max((repeat.end - repeat.start for repeat in repeats(values[free], [], 1)), default=1)
     move, least = usual_move(values, free), _STEPS * max(step_of_digits(v) for v in values.unbind(-1))
+    # rows that repeat a value count too: those that differ from the row before flicker between coarse digits
     noisy = any(
-        quietest_noise(column[free & fresh]) >= _NOISY * max(step_of_digits(column), 1e-300)
+        min(quietest_noise(column[free & fresh]), quietest_noise(column[free]))
+        >= _NOISY * max(step_of_digits(column), 1e-300)
         for column in values.unbind(-1)
     )
     others_move = usual_move(turned, free)

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
 from mkc_torch import Recording
@@ -99,6 +99,7 @@ def test_real_recordings_of_coarser_digits_repeated_samples_or_a_rest_have_no_fa
 
 
 @given(st.floats(0.0, 1.0), st.floats(0.05, 4.0), st.floats(0.2, 3.0), st.integers(0, 99))
+@example(0.125, 4.0, 0.21875, 0)  # a slow turn with a digital step of many times the noise
 @settings(max_examples=15, deadline=None)
 def test_a_turning_sensor_of_any_digits_and_noise_has_no_fault(noise, step, speed, seed):
     assert fault_warnings(recorded(rounded_to(turned(noise=noise, seed=seed, speed=speed), step))) == []

@@ -25,13 +25,16 @@ def add_along_noise(beam: BeamSearch, terms: Sequence[Term]) -> None:
     """Add effects to the best model of a beam along its process noise, as long as that raises the score.
 
     A trajectory that an observer corrects stays near the recording, so that the linear gain of an effect holds where
-    a small force decides which way an open loop takes.
+    a small force decides which way an open loop takes. A search for a single effect, whose candidates start along the
+    noise of the simulation alone, does without.
 
     Args:
         beam: the models so far; receives the new ones, up to its largest number.
         terms: the candidates.
     """
     best = None
+    if beam.most_terms == 1:
+        return
     while best is not beam.best and len(beam.models) < beam.most_models:
         best = beam.best
         known = best.fit.model.terms
