@@ -364,18 +364,19 @@ def with_profiled_shape(fit: FittedModel) -> FittedModel:
     return fit
 
 
-def likelihood_of(fit: FittedModel) -> float:
-    """Return the log-likelihood of a fit, in nats."""
-    return fit.log_likelihood
+Better = Callable[[FittedModel, FittedModel], bool]
+"""Whether the first of two fits is the better."""
+
+
+def more_likely(other: FittedModel, fit: FittedModel) -> bool:
+    """Whether a fit is more likely than another by more than rounding and the end of an iteration."""
+    return other.log_likelihood > fit.log_likelihood + _SETTLED_NATS
 
 
 def with_form_of_grid(
-    fit: FittedModel,
-    effort: Effort = FULL,
-    value: Callable[[FittedModel], float] = likelihood_of,
-    number: int = -1,
+    fit: FittedModel, effort: Effort = FULL, better: Better = more_likely, number: int = -1
 ) -> FittedModel:
-    """Return the fit with the form of an effect, such as a width, moved along its grid while the fit's value grows.
+    """Return the fit with the form of an effect, such as a width, moved along its grid while the fit gets better.
 
     The search chooses a form by its linearised gain, which differs little between forms, but the joint fits can differ
     by more than those of two effects: dry friction whose sign changes too slowly loses to one that falls with speed.
@@ -383,20 +384,16 @@ def with_form_of_grid(
     Args:
         fit: with at least one effect, at its most likely parameters.
         effort: how far each fit goes.
-        value: of a fit, in nats, by which forms are compared.
+        better: compares two forms.
         number: of the effect; default the last.
     """
     effect, prepared = fit.model.terms[number].effect, fit.model.prepared
     for name in set(effect.form_parameters) & set(effect.relative):
         port = prepared.ports[fit.model.terms[number].port]
         grid = sorted({absolute(effect, shape, port)[name] for shape in effect.shapes(prepared.time)})
-        known = value(fit) if len(grid) > 1 else 0.0
         for steps in (-1, 1):
-            while (moved := _at_next(fit, number, name, grid, steps, effort)) is not None:
-                other = value(moved)
-                if not other > known + _SETTLED_NATS:
-                    break
-                fit, known = moved, other
+            while (moved := _at_next(fit, number, name, grid, steps, effort)) is not None and better(moved, fit):
+                fit = moved
     return fit
 
 

@@ -184,7 +184,7 @@ class BeamSearch:
         self, fit: FittedModel, addition: Addition, others: Sequence[Callable[[], FittedModel | None]] = ()
     ) -> FittedModel:
         implausible = partial(is_implausible, basis=self.basis)
-        return fitted_with(fit, addition, others, implausible=implausible, value=self.value_of)
+        return fitted_with(fit, addition, others, implausible=implausible, better=self.is_better)
 
     def distinct(
         self, fit: FittedModel, addition: Addition, others: Sequence[Callable[[], FittedModel | None]] = ()
@@ -223,7 +223,7 @@ class BeamSearch:
                     less = None if known is None else known.fit
                     work = partial(fitted_in_form, fit, number, group, self.settings.noise, less)
                 else:
-                    work = partial(fitted_exchanged, fit, number, group, self.value_of)
+                    work = partial(fitted_exchanged, fit, number, group, self.is_better)
                 works.append((model_key([*rest, other]), move, work))
         orders = in_other_orders(fit)
         works += [(model_key(o), "another order in series", partial(fitted_reordered, fit, o)) for o in orders]
@@ -381,6 +381,10 @@ class BeamSearch:
         found = self.score_of(fit)
         return -math.inf if found is None else found.value
 
+    def is_better(self, other: FittedModel, fit: FittedModel) -> bool:
+        """Whether the recording separates a fit from another that scores lower."""
+        return self.value_of(other) > self.value_of(fit) + self.settings.naming.separable * self.basis.kappa
+
     def scored(self, move: str, work: Callable[[], FittedModel | None]) -> Candidate | None:
         self._scores.clear()
         fit = work()
@@ -422,13 +426,10 @@ class BeamSearch:
 
     def simplified(self, model: Candidate) -> Candidate:
         """Return a model with the simpler forms of its effects that this recording cannot separate from it."""
+        less = self.settings.naming.separable * self.basis.kappa
         for number in range(len(model.fit.model.terms)):
             other = fitted_simpler(model.fit, number)
-            model = (
-                model
-                if other is None
-                else self._better(model, other, self.settings.naming.separable * self.basis.kappa)
-            )
+            model = model if other is None else self._better(model, other, less)
         return model
 
     def to_the_end(self, model: Candidate) -> Candidate:

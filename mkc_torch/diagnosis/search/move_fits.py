@@ -18,7 +18,7 @@ from mkc_torch.diagnosis.model.fit import (
     without_term,
 )
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.shapes import likelihood_of, shape_fitted, with_form_of_grid
+from mkc_torch.diagnosis.model.shapes import Better, shape_fitted, with_form_of_grid
 from mkc_torch.diagnosis.model.simpler import simpler_start
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.search.moves import Addition, additions, at_size_zero
@@ -118,7 +118,7 @@ def fitted_with(
     others: Sequence[Callable[[], FittedModel | None]] = (),
     *,
     implausible: Callable[[FittedModel], bool] = lambda _: False,
-    value: Callable[[FittedModel], float] = likelihood_of,
+    better: Better | None = None,
 ) -> FittedModel:
     """Return the most likely plausible fit with one more effect, from its best shapes and from other fits.
 
@@ -128,7 +128,7 @@ def fitted_with(
         others: further fits with the effect.
         implausible: whether a fit is not to be returned if there is another, such as a curve of the angle that cancels
             the simulation's own gravity.
-        value: of a fit, in nats, by which forms such as a width are compared.
+        better: compares forms such as a width with the most likely form; None for that.
     """
     begun = sorted((_begun(fit, term, size) for term, size in addition.starts), key=lambda found: -found.log_likelihood)
     least = 0.5 * (begun[0].log_likelihood + fit.log_likelihood)
@@ -136,7 +136,8 @@ def fitted_with(
     near += [found for other in others if (found := other()) is not None]
     polished = [_polished(found) for found in near]
     plausible = [found for found in polished if not implausible(found)]
-    return with_form_of_grid(most_likely(plausible or polished), SEARCH, value)
+    found = with_form_of_grid(most_likely(plausible or polished), SEARCH)
+    return found if better is None else with_form_of_grid(found, SEARCH, better)
 
 
 def _polished(begun: FittedModel) -> FittedModel:
@@ -166,16 +167,16 @@ def fitted_without(fit: FittedModel, number: int) -> FittedModel | None:
 
 
 def fitted_exchanged(
-    fit: FittedModel, number: int, group: Sequence[Term], value: Callable[[FittedModel], float] = likelihood_of
+    fit: FittedModel, number: int, group: Sequence[Term], better: Better | None = None
 ) -> FittedModel | None:
     """Return the fit with another effect in place of one, from all shapes of its grid.
 
-    ``value`` is that of a fit, in nats, by which forms such as a width are compared.
+    ``better`` compares forms, as in :func:`fitted_with`.
     """
     rest = fitted_without(fit, number) if len(fit.model.terms) > 1 else _refitted(without_term(fit, number), fit)
     if rest is None:
         return None
-    return fitted_with(rest, at_size_zero(rest, group), value=value)
+    return fitted_with(rest, at_size_zero(rest, group), better=better)
 
 
 def _refitted(start: FittedModel, like: FittedModel) -> FittedModel | None:
