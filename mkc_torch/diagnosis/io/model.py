@@ -252,9 +252,8 @@ class DiagnosedModel(CorrectingModel):
         Raises:
             SourceError: the simulation is no MuJoCo model.
         """
-        text, _ = self.to_mjcf()
-        assert isinstance(self.source, MujocoStepper)
-        return mjcf_changes(self.source, text)
+        text = self.to_mjcf()[0]
+        return mjcf_changes(self.source, text) if isinstance(self.source, MujocoStepper) else ""
 
     @staticmethod
     def from_json(

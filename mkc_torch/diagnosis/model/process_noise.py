@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,8 +21,6 @@ from mkc_torch.diagnosis.thresholds import HOLD
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.first_fit import multiple_shooting_start, with_strong_observer
 from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, most_likely_noise
-from mkc_torch.simulation.dynamics.noise_model import NoiseModel
-from mkc_torch.simulation.dynamics.noise_selection import SelectedNoise
 from mkc_torch.simulation.dynamics.other_starts import other_starts
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.protocol import PreparedSimulation
@@ -218,7 +215,7 @@ def fit_with_process_noise(
     if more_starts and system is not None:
         works.append(partial(_from_given, system, bound, declared, settings))
     if free is not None and not works:
-        works = [partial(_under_noise, free, noise, declared, settings)]
+        works = [partial(under_noise, free, noise, declared, settings)]
     tried = run_parallel(works, own.prepared)
     found = [pair for pair in tried if pair is not None]
     if not found:
@@ -278,41 +275,6 @@ def with_noise_around(fit: FittedModel, declared: Mapping[str, float], settings:
     )
 
 
-def along_noise(
-    fit: FittedModel, noise: NoiseModel, declared: Mapping[str, float], settings: NoiseSettings
-) -> FittedModel | None:
-    """Return a fit under the process noise of a noise model, whose sizes are fitted again; None where that fails.
-
-    Args:
-        fit: in open loop.
-        noise: only its disturbances of rates are used.
-        declared: known standard deviations of the outputs' white noise.
-        settings: of the noise.
-    """
-    system = fit.model.prepared.dynamics
-    assert system is not None
-    each = noise.disturbances(system.disturbable, system.channels)
-    acting = tuple(disturbance for disturbance in each if disturbance.at_rate)
-    if not acting:
-        return None
-    unknown, sensor = (math.inf,) * len(acting), fit.residual.new_tensor(noise.sensor)
-    known = tuple(name in declared for name in system.channels)
-    given = SelectedNoise(acting, unknown, unknown, sensor, -math.inf, known)
-    theta, changes = fit.parameters[: fit.model.base], fit.model.changes(fit.parameters)
-    least, most = settings.disturbance_gain, settings.max_disturbances
-    sized = most_likely_noise(
-        system, theta, changes, fit.model.near, declared=declared, least=least, most=most, known=given
-    )
-    found = _under_noise(fit, sized, declared, settings)
-    return None if found is None or not has_process_noise(found[0]) else found[0]
-
-
-def under_its_noise(fit: FittedModel, declared: Mapping[str, float], settings: NoiseSettings) -> FittedModel:
-    """Return a fit along an observer, fitted again under the noise that is most likely along it; else the same fit."""
-    found = _under_noise(fit, estimate_noise(fit, declared, settings), declared, settings)
-    return fit if found is None else found[0]
-
-
 def refit_open_loop(fit: FittedModel) -> FittedModel | None:
     """Return the open-loop fit of the same joint model; None if that loses the recording."""
     return fit.open_loop
@@ -328,7 +290,7 @@ def _free(model: JointModel, start: Float[Tensor, " p"]) -> FittedModel | None:
 _Found = tuple[FittedModel, StateSpaceNoise]
 
 
-def _under_noise(
+def under_noise(
     fit: FittedModel, noise: StateSpaceNoise | None, declared: Mapping[str, float], settings: NoiseSettings
 ) -> _Found | None:
     """Alternate noise estimation and fit; return the most likely fit with the noise around it."""
@@ -370,7 +332,7 @@ def _from_short(
         return None
     if bound is None:
         fit = replace(fit, bound=settings.domain * fit.bound.maximum(fit.bound.mean()))
-    return _under_noise(fit, estimate_noise(fit, declared, settings), declared, settings)
+    return under_noise(fit, estimate_noise(fit, declared, settings), declared, settings)
 
 
 def _from_given(
@@ -392,7 +354,7 @@ def _from_given(
         fit = fitted(JointModel(system.observed(noise.observer)), start, bound, graduate=False)
     except NoFitError:
         return None
-    return _under_noise(fit, estimate_noise(fit, declared, settings), declared, settings)
+    return under_noise(fit, estimate_noise(fit, declared, settings), declared, settings)
 
 
 def choose_input_hold(
@@ -449,7 +411,7 @@ def _holding(
         fit = fitted(JointModel(prepared, (), base.fit.model.near), base.fit.parameters, base.fit.bound, fresh=True)
     except NoFitError:
         return None
-    found = _under_noise(fit, estimate_noise(fit, declared, settings, base.noise), declared, settings)
+    found = under_noise(fit, estimate_noise(fit, declared, settings, base.noise), declared, settings)
     if found is None or (found[1].observer is None and free is None):
         return None
     if found[1].observer is None or (free is not None and free.log_likelihood > found[0].log_likelihood):

@@ -9,10 +9,10 @@ import torch
 from mkc_torch import Recording
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.process_noise import along_noise, has_process_noise
+from mkc_torch.diagnosis.model.process_noise import has_process_noise
 from mkc_torch.diagnosis.model.shapes import candidate_terms
 from mkc_torch.diagnosis.score import basis_of, score
-from mkc_torch.diagnosis.search.along_noise import add_along_noise
+from mkc_torch.diagnosis.search.along_noise import add_along_noise, fitted_along
 from mkc_torch.diagnosis.search.beam import BeamSearch
 from mkc_torch.diagnosis.search.candidate import Candidate
 from mkc_torch.diagnosis.search.moves import with_wide_grid
@@ -97,6 +97,6 @@ def test_effects_that_are_not_there_are_not_added():
 def test_a_model_under_white_noise_alone_has_no_fit_along_noise():
     beam, _ = searched()
     alone = beam.models[()]
-    assert has_process_noise(along_noise(alone.fit, alone.score.noise, {}, SETTINGS.noise))
+    assert has_process_noise(fitted_along(alone.fit, alone.score.noise, {}, SETTINGS.noise))
     white = type(alone.score.noise)(alone.score.noise.sensor)
-    assert along_noise(alone.fit, white, {}, SETTINGS.noise) is None
+    assert fitted_along(alone.fit, white, {}, SETTINGS.noise) is None
