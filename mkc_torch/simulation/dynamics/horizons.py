@@ -1,17 +1,17 @@
 """Predictions of a flow several samples ahead, under many noise models at once.
 
-A filter gives the states at each sample. Transitions over h samples are composed by doubling, so that the cost grows
-with the logarithm of the longest horizon. Before a run's first h samples a prediction is the free run from its start.
+A filter gives the states at each sample. Before a run's first h samples a prediction is the free run from its start.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mkc_torch.simulation.dynamics.composed import Disturbances, composed, times, times_transposed, times_vector
 from mkc_torch.simulation.dynamics.kalman import OUTLIERS, FilterModels, Flow, robust_likelihood
 from mkc_torch.simulation.dynamics.kalman import Filtered as Innovations
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel, filter_models
@@ -114,63 +114,25 @@ def _ahead(flow: Flow, models: FilterModels, horizons: Sequence[int]) -> Innovat
     empty = [np.empty(0)] * 4
     if not models.white.any() and not models.place.shape[1]:
         return Innovations(found.standard, found.log_spread, *empty)  # no correction: all horizons are the free run
-    n, p, m = flow.transition.shape[1], flow.rates, flow.new.shape[1]
-    B, k = len(models), n + models.place.shape[1]
-    C = np.zeros((m, k, B, len(flow.new)))
-    C[:, :n] = flow.seen.transpose(1, 2, 0)[:, :, None]
-    for j in range(m):
-        C[j, n:] = (models.place == p + j).T[:, :, None]
     mean = np.ascontiguousarray(found.after[:, 0].transpose(2, 1, 0))
     covariance = np.ascontiguousarray(found.posterior[:, 0].transpose(2, 3, 1, 0))
+    seen = np.ascontiguousarray(flow.seen.transpose(1, 2, 0))
+    (m, n, N), B = seen.shape, len(models)
+    kinds = Disturbances.of(models)
     standard, log_spread = [], []
-    for carry, noise, shift, horizon in _composed(flow, models, horizons):
-        behind = slice(0, max(len(flow.new) - horizon, 0))
-        state, spread = shift.copy(), noise.copy()
-        state[..., horizon:] += _times_vector(carry[..., horizon:], mean[..., behind])
-        moved = _times(carry[..., horizon:], covariance[..., behind])
-        spread[..., horizon:] += _times_transposed(moved, carry[..., horizon:])
-        new = flow.new.T[:, None] - _times_vector(C, state)
-        S = _times_transposed(_times(C, spread), C)
+    for ahead, horizon in composed(flow, kinds, horizons):
+        behind = slice(0, max(N - horizon, 0))
+        by_kind, noise = ahead.shown(seen, kinds.place - flow.rates)
+        S = np.einsum("ijun,bu->ijbn", noise, kinds.variance)
+        new = np.repeat((flow.new.T - times_vector(seen, ahead.shift))[:, None], B, 1)
+        back = np.broadcast_to(times(seen, ahead.carry)[:, :, None], (m, n, B, N))
+        G = np.concatenate([back, by_kind[:, kinds.slots].transpose(0, 2, 1, 3)], 1)[..., horizon:]
+        new[..., horizon:] -= times_vector(G, mean[..., behind])
+        S[..., horizon:] += times_transposed(times(G, covariance[..., behind]), G)
         z, log = _standardised(new, S, models.sensor.T)
         standard.append(z)
         log_spread.append(log)
     return Innovations(np.stack(standard).transpose(3, 0, 2, 1), np.stack(log_spread).transpose(3, 0, 2, 1), *empty)
-
-
-def _composed(
-    flow: Flow, models: FilterModels, horizons: Sequence[int]
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, int]]:
-    """Yield transitions (k, k, B, N), their noise and their shift (k, B, N) to each sample over each horizon."""
-    N, n, p = len(flow.new), flow.transition.shape[1], flow.rates
-    B, D = models.place.shape
-    carry, noise = np.zeros((n + D, n + D, B, N)), np.zeros((n + D, n + D, B, N))
-    shift = np.zeros((n + D, B, N))
-    carry[:n, :n, :, 1:] = flow.transition.transpose(1, 2, 0)[:, :, None]
-    shift[:n, :, 1:] = -flow.shift.T[:, None]
-    white = flow.noise_input.transpose(1, 2, 0)[:, :, None] * models.white.T[:, :, None]
-    noise[:n, :n, :, 1:] = _times_transposed(white, white)
-    for d in range(D):
-        place, size = models.place[:, d], models.size[:, d, None]
-        phi = np.where(flow.step > 0, np.exp(-flow.step / models.lasting[:, d, None]), 0.0)
-        carry[n + d, n + d, :, 1:] = phi
-        noise[n + d, n + d, :, 1:] = size**2 * (1.0 - phi**2)
-        noise[n + d, n + d, :, 0] = size[:, 0] ** 2
-        for row in np.flatnonzero(place < p):
-            carry[:n, n + d, row, 1:] = flow.noise_input[:, :, place[row]].T
-    horizon = 1
-    while True:
-        if horizon in horizons:
-            yield carry, noise, shift, horizon
-        if horizon >= horizons[-1]:
-            return
-        behind, ahead = slice(0, max(N - horizon, 0)), carry[..., horizon:]
-        longer, more = np.zeros_like(carry), noise.copy()
-        moved = _times(ahead, noise[..., behind])
-        more[..., horizon:] += _times_transposed(moved, ahead)
-        further = shift.copy()
-        further[..., horizon:] += _times_vector(ahead, shift[..., behind])
-        longer[..., horizon:] = _times(ahead, carry[..., behind])
-        carry, noise, shift, horizon = longer, more, further, 2 * horizon
 
 
 def _standardised(
@@ -188,19 +150,3 @@ def _standardised(
         z[i] = (new[i] - (factor[i, :i] * z[:i]).sum(0)) / factor[i, i]
         log[i] = np.log(factor[i, i])
     return z, log
-
-
-def _times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Products of matrices whose elements are in the first two dimensions."""
-    result: np.ndarray = np.einsum("ij...,jk...->ik...", a, b)
-    return result
-
-
-def _times_transposed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    result: np.ndarray = np.einsum("ij...,kj...->ik...", a, b)
-    return result
-
-
-def _times_vector(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    result: np.ndarray = np.einsum("ij...,j...->i...", a, b)
-    return result
