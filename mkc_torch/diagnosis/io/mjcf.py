@@ -34,8 +34,13 @@ def mjcf_source(
 
     joints = {force: joint for joint, force in zip(system.positions, system.forces, strict=True)}
     added: dict[tuple[str, str], float] = {}
+    changed: dict[str, float] = {}
     others = []
     for term, gamma in zip(terms, gammas, strict=True):
+        if term.port.startswith("constant "):
+            name = term.port.removeprefix("constant ")
+            changed[name] = changed.get(name, 0.0) + float(gamma[0])
+            continue
         joint = joints.get(term.port.removeprefix("entry of "))
         attribute = _ATTRIBUTES.get(term.effect.id)
         if joint is None or attribute is None or term.driver is not None or not float(gamma[0]) > 0.0:
@@ -45,7 +50,7 @@ def mjcf_source(
     values = dict(zip(system.parameters, theta, strict=False))
     only = f" Only corrected.py has: {'; '.join(others)}." if others else ""
     note = f"With the findings of mkc diagnose.{only}".replace("--", "-")  # a comment cannot hold two hyphens
-    return corrected_xml(system.description, values, added, note), tuple(others)
+    return corrected_xml(system.description, values, added, changed, note), tuple(others)
 
 
 def mjcf_changes(system: MujocoStepper, text: str) -> str:

@@ -80,7 +80,7 @@ def python_source(
     for number in in_order_of_the_chain(terms, range(len(terms))):
         term, gamma = terms[number], gammas[number]
         lines = _lines(term, [_rounded(float(value)) for value in gamma], system, measured)
-        kinds = {"output": outputs, "input": inputs, "entry": entering, "parameter": varied}
+        kinds = {"output": outputs, "input": inputs, "constant": inputs, "entry": entering, "parameter": varied}
         place = kinds.get(term.port.partition(" ")[0], rates)
         place = single if term.port.startswith("output ") else place
         if place is outputs and outputs:
@@ -323,8 +323,8 @@ def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Seque
         speed = entries(system, known, kinematic(system, known))[name]
         targets = [f"acting.{name}"]
         names = _parts(speed, system)
-    elif term.port.startswith("input "):
-        name = term.port.removeprefix("input ")
+    elif term.port.startswith(("input ", "constant ")):
+        name = term.port.partition(" ")[2]
         targets, names = [f"acting.{name}"], {"own": f"acting.{name}"}
     elif term.port.startswith("output "):
         name = term.port.removeprefix("output ")

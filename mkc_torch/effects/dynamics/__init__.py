@@ -7,6 +7,7 @@ from mkc_torch.effects.dynamics.added_mass import AddedMass
 from mkc_torch.effects.dynamics.backlash import Backlash
 from mkc_torch.effects.dynamics.bouc_wen_hysteresis import BoucWenHysteresis
 from mkc_torch.effects.dynamics.buoyancy import Buoyancy
+from mkc_torch.effects.dynamics.constant_change import ConstantChange
 from mkc_torch.effects.dynamics.constant_force import ConstantForce
 from mkc_torch.effects.dynamics.coulomb_friction import CoulombFriction
 from mkc_torch.effects.dynamics.coupling import Coupling
@@ -78,6 +79,7 @@ DYNAMICS: tuple[Effect, ...] = (
     Overflow(),
     ThermalLoss(to_surroundings=True),
     ThermalLoss(),
+    ConstantChange(),
     InputDelay(),
     InputTransportDelay(),
     InputLag(),

@@ -14,6 +14,7 @@ from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.missing import MissingOutputs
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observer, ObserverJump
 from mkc_torch.simulation.dynamics.single_outputs import with_changes
+from mkc_torch.simulation.dynamics.steps import port_of
 from mkc_torch.simulation.dynamics.user_functions import namespace
 from mkc_torch.simulation.dynamics.varying import Acting, varied
 from mkc_torch.simulation.names import Names
@@ -106,8 +107,8 @@ class ObservedDynamics:
         if not self.system.inputs:
             return self.inputs
         columns = {
-            name: self.inputs[:, k] + changes[f"input {name}"](self.inputs[:, [k]])[:, 0]
-            if f"input {name}" in changes
+            name: self.inputs[:, k] + changes[port](self.inputs[:, [k]])[:, 0]
+            if (port := port_of(self.system.steps, name)) in changes
             else self.inputs[:, k]
             for k, name in enumerate(self.system.inputs)
         }
@@ -124,7 +125,7 @@ class ObservedDynamics:
 
     def acts_on_outputs(self, changes: Changes) -> bool:
         """Whether an output depends on an input directly, and an effect or the actuator changes an input."""
-        changed = any(f"input {name}" in changes for name in self.system.inputs)
+        changed = any(port_of(self.system.steps, name) in changes for name in self.system.inputs)
         return (changed or self._has_actuator) and self._feeds_through
 
     @cached_property

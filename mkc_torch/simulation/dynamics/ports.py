@@ -67,13 +67,13 @@ class PortContext:
     run: Int[Tensor, " N"]
 
     def ports(self) -> dict[str, Port]:
-        """The ports: rates, exchanges between states of the same unit, inputs, their entries, parameters, and outputs.
+        """The ports: rates, exchanges of states of a unit, inputs, their entries, constants, parameters, and outputs.
 
         Where an input moves one rate only, an effect at its entry would be the same as at the rate, and has no port.
         """
         system = self.system
         places = {}
-        forces = {} if system.steps is None else system.steps.forces
+        forces, constants = ({}, ()) if system.steps is None else (system.steps.forces, system.steps.constants)
         free = [state for state in system.states if state not in self.kinematic and state not in forces.values()]
         for state in free:
             parts = self._parts(state)
@@ -93,7 +93,7 @@ class PortContext:
             levels = {"level": first, "other level": second} if both else {}
             port = self._rate_port(first, "exchange", {"own": first, "other": second, **sideways, **levels})
             places[f"exchange of {first} and {second}"] = replace(port, channels=(first, second))
-        for name in (name for name in system.inputs if name not in forces):
+        for name in (name for name in system.inputs if name not in forces and name not in constants):
             actuator = {} if name in self._surroundings.values() else {"actuator": name}
             places[f"input {name}"] = Port(
                 (name,),
@@ -107,6 +107,18 @@ class PortContext:
                 run=self.run[self.clock.before],
             )
         places |= {f"entry of {name}": self._entry_port(name, speed) for name, speed in self._entries().items()}
+        for name in constants:
+            parts, unit = {"own": name}, self._unit_of(name)
+            places[f"constant {name}"] = Port(
+                (name,),
+                unit,
+                pointwise=False,
+                kind="constant",
+                parts=parts,
+                part_units={"own": unit},
+                clock=self.clock,
+                run=self.run[self.clock.before],
+            )
         for name in varying_parameters(system):
             known = self.known[name]
             places[f"parameter {name}"] = Port(

@@ -35,6 +35,7 @@ from mkc_torch.simulation.dynamics.rollout import rolled_out, rolls_out
 from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
 from mkc_torch.simulation.dynamics.settings import HORIZON
 from mkc_torch.simulation.dynamics.single_outputs import with_changes
+from mkc_torch.simulation.dynamics.steps import port_of
 from mkc_torch.simulation.dynamics.trajectory import Trajectory, marched, solve, stations
 from mkc_torch.simulation.dynamics.user_functions import kinematic, namespace
 from mkc_torch.simulation.dynamics.varying import Acting
@@ -286,7 +287,7 @@ class PreparedDynamics(CheckedDynamics):
             for name, port in self.ports.items()
             if port.kind in (*RATES, ENTRY)
         }
-        at |= {f"input {name}": self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
+        at |= {port_of(self.system.steps, name): self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
         still = torch.zeros_like(self.clock.time).unsqueeze(-1)
         p = self.parameters_of(theta)
         varying = [port.channels[0] for port in self.ports.values() if port.kind == "parameter"]

@@ -19,6 +19,7 @@ class Steps:
         size: length of a step in s.
         positions: state that is a position, to the state that is its speed.
         forces: input that is a force acting along a speed, to this speed; its column is 0 in every recording.
+        constants: input that is the change of a constant of the simulation; its column is 0 in every recording.
         rollout: from a state (1, n), inputs (T, u) and the parameters to the states after each of T steps, (T, n),
             without derivatives.
     """
@@ -26,4 +27,10 @@ class Steps:
     size: float
     positions: Mapping[str, str]
     forces: Mapping[str, str]
+    constants: tuple[str, ...]
     rollout: Callable[[Tensor, Tensor, Any], Tensor]
+
+
+def port_of(steps: Steps | None, name: str) -> str:
+    """The name of the port at an input; a constant of a simulation that steps has a kind of its own."""
+    return f"constant {name}" if steps is not None and name in steps.constants else f"input {name}"

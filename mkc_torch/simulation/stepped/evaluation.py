@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from mkc_torch.simulation.foreign.evaluation import CachedEvaluation, EvaluationPoints, Group
 from mkc_torch.simulation.names import Names
-from mkc_torch.simulation.parameter import SimulationError
+from mkc_torch.simulation.parameter import Parameter, SimulationError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,8 +43,10 @@ class StepperEvaluation(CachedEvaluation):
 
     Args:
         stepper: the simulation.
-        states, inputs, parameters: names in the order of the arrays; after the inputs come the forces.
+        states, inputs, parameters: names in the order of the arrays; after the inputs come the forces, and then the
+            changes of the constants.
         shown: names of the outputs that are no states.
+        constants: by name, in the order of their changes.
     """
 
     def __init__(
@@ -53,14 +56,15 @@ class StepperEvaluation(CachedEvaluation):
         inputs: tuple[str, ...],
         parameters: tuple[str, ...],
         shown: tuple[str, ...] = (),
+        constants: Mapping[str, Parameter] = MappingProxyType({}),
     ) -> None:
         super().__init__()
-        self.stepper, self.shown = stepper, shown
+        self.stepper, self.shown, self.constants = stepper, shown, dict(constants)
         self._slopes: dict[tuple[bool, Group], tuple[EvaluationPoints, Array]] = {}
         self.states, self.inputs, self.parameters = states, inputs, parameters
 
     def __getstate__(self) -> tuple[object, ...]:
-        return self.stepper, self.states, self.inputs, self.parameters, self.shown
+        return self.stepper, self.states, self.inputs, self.parameters, self.shown, self.constants
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         StepperEvaluation.__init__(self, *state)
@@ -73,7 +77,29 @@ class StepperEvaluation(CachedEvaluation):
         found = np.empty((len(states), self.count(outputs)))
         for first in range(0, len(states), _BATCH):
             part = slice(first, first + _BATCH)
-            found[part] = self._at(outputs, states[part], given[part], self._named(parameters))
+            found[part] = self._with_constants(outputs, states[part], given[part], parameters)
+        return found
+
+    def changed(self, change: Array) -> dict[str, float] | None:
+        """The constants after a change of each, (c,); None where a constant leaves its bounds."""
+        found = {
+            name: known.value + float(by) for (name, known), by in zip(self.constants.items(), change, strict=True)
+        }
+        within = all(known.lower <= found[name] <= known.upper for name, known in self.constants.items())
+        return found if within else None
+
+    def _with_constants(self, outputs: bool, states: Array, given: Array, parameters: Array) -> Array:
+        """The values at states and inputs; one call for all points with the same constants."""
+        named = dict(zip(self.parameters, parameters.tolist(), strict=True))
+        if not self.constants:
+            return self._at(outputs, states, given, Names(**named))
+        first = given.shape[1] - len(self.constants)
+        found = np.full((len(states), self.count(outputs)), np.nan)
+        different, group = np.unique(given[:, first:], axis=0, return_inverse=True)
+        for k, change in enumerate(different):
+            rows, constants = group.reshape(-1) == k, self.changed(change)
+            if constants is not None:
+                found[rows] = self._at(outputs, states[rows], given[rows, :first], Names(**named, **constants))
         return found
 
     def slopes(self, outputs: bool, at: EvaluationPoints, group: Group) -> Array:
@@ -116,10 +142,6 @@ class StepperEvaluation(CachedEvaluation):
                 f"{stepper.name}.step: expected states of shape {states.shape}, like x, but got {after.shape}."
             )
         return np.asarray((after - states) / stepper.time_step)
-
-    def _named(self, values: Array) -> Names:
-        return Names(**dict(zip(self.parameters, values.tolist(), strict=True)))
-
 
 def _moved(values: Array, place: int, step: float) -> Array:
     """A copy with a step added to the values at one place of the first axis."""

@@ -7,7 +7,7 @@ Its states follow the map of its own steps, not a differential equation: the rec
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.dynamics.steps import Steps
 from mkc_torch.simulation.foreign.function import evaluated
 from mkc_torch.simulation.names import Names
-from mkc_torch.simulation.parameter import SimulationError
+from mkc_torch.simulation.parameter import Parameter, SimulationError, known_parameters
 from mkc_torch.simulation.stepped.evaluation import StepperEvaluation
 
 if TYPE_CHECKING:
@@ -45,13 +45,16 @@ class Stepper(Dynamics):
         forces: force that effects may add, to the state that is the speed along which it acts. A force at each joint
             acts through the simulation's own masses. Its name is free: it is no column of the recording.
         parameters: start value, or :class:`Parameter`, by name.
+        constants: numbers that the simulation takes as known and effects may change, such as a payload: value, or
+            :class:`Parameter`, by name. ``step`` reads them like parameters, as ``p.payload``; outside of their bounds
+            it fails.
         initial: guess of the initial value by state, for states that are not measured; default 0.
         units: unit by state, input or force; the unit of a force is that of the sizes of effects there.
         time_step: length of a step in s. Samples are as many steps apart as is nearest, at least one.
 
     Raises:
         SimulationError: no ``time_step``, a ``step`` that returns another shape, or a recording with a column that has
-            the name of a force.
+            the name of a force or a constant.
 
     Example:
         A mass that a force accelerates, by semi-implicit Euler steps:
@@ -74,6 +77,7 @@ class Stepper(Dynamics):
 
     positions: Mapping[str, str] = {}
     forces: Mapping[str, str] = {}
+    constants: Mapping[str, float | Parameter] = {}
     time_step: float = 0.0
     input_hold = "held"
 
@@ -86,7 +90,7 @@ class Stepper(Dynamics):
             x: (B, states), independent states before the step, whose next ones are computed in one call.
             u: (B, inputs), held over the step.
             tau: (B, forces), additional forces, held over the step.
-            p: the parameters as attributes, a number each.
+            p: the parameters and the constants as attributes, a number each.
             dt: length of the step in s.
 
         Returns:
@@ -102,7 +106,7 @@ class Stepper(Dynamics):
 
         Args:
             x, u: (B, states), (B, inputs).
-            p: the parameters as attributes.
+            p: the parameters and the constants as attributes.
         """
         return {}
 
@@ -125,11 +129,11 @@ class Stepper(Dynamics):
 
     @property
     def steps(self) -> Steps:  # type: ignore[override]
-        return Steps(self.time_step, self.positions, self.forces, self._rolled_out)
+        return Steps(self.time_step, self.positions, self.forces, tuple(self.constants), self._rolled_out)
 
     @property
     def columns(self) -> frozenset[str]:
-        return super().columns | frozenset(self.forces)
+        return super().columns | frozenset(self._added)
 
     def derivative(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor]:
         """Return the change of the states over one step divided by its length."""
@@ -148,13 +152,23 @@ class Stepper(Dynamics):
         if not self.time_step > 0.0:
             raise SimulationError(f"{self.name}: `time_step` expected a length in s above 0, got {self.time_step!r}.")
         own = copy.copy(self)
-        own.inputs = (*self._driven, *self.forces)
-        return Dynamics.prepare(own, _with_forces(recording, self))
+        own.inputs = (*self._driven, *self._added)
+        own.units = {**self._units_of_constants, **self.units}
+        return Dynamics.prepare(own, _with_zeros(recording, self, self._added))
 
     @property
     def _driven(self) -> tuple[str, ...]:
         """The inputs that are columns of a recording."""
-        return tuple(name for name in self.inputs if name not in self.forces)
+        return tuple(name for name in self.inputs if name not in self._added)
+
+    @property
+    def _added(self) -> tuple[str, ...]:
+        """The inputs that only effects change: forces, and changes of constants."""
+        return (*self.forces, *self.constants)
+
+    @property
+    def _units_of_constants(self) -> dict[str, str]:
+        return {name: known.unit for name, known in known_parameters(self.name, self.constants).items()}
 
     @cached_property
     def _evaluation(self) -> StepperEvaluation:
@@ -163,14 +177,19 @@ class Stepper(Dynamics):
         states = base.states if issubclass(base, Stepper) and base.states else self.states
         known = (*states, *self._driven)
         shown = tuple(name for name in self.outputs if name not in known)
-        return StepperEvaluation(self, states, self._driven, tuple(self.parameters), shown)
+        constants = known_parameters(self.name, self.constants)
+        return StepperEvaluation(self, states, self._driven, tuple(self.parameters), shown, constants)
 
     def _rolled_out(self, state: Tensor, inputs: Tensor, p: Any) -> Tensor:
         """The states after each step, as a tensor."""
         m = len(self._driven)
-        given, named = inputs.detach().cpu().numpy(), Names(**{name: float(value) for name, value in vars(p).items()})
-        x = state[0].detach().cpu().numpy()
-        return torch.from_numpy(self.rollout(x, given[:, :m], given[:, m:], named, self.time_step)).to(state)
+        given, known = inputs.detach().cpu().numpy(), {name: float(value) for name, value in vars(p).items()}
+        x, forces = state[0].detach().cpu().numpy(), slice(m, m + len(self.forces))
+        changed = self._evaluation.changed(given[0, forces.stop :]) if len(given) else {}
+        if changed is None:
+            return inputs.new_full((len(given), len(x)), torch.nan)
+        named = Names(**known, **changed)
+        return torch.from_numpy(self.rollout(x, given[:, :m], given[:, forces], named, self.time_step)).to(state)
 
     def _evaluated(self, outputs: bool, time: Tensor, x: Any, u: Any, p: Any) -> Tensor:
         evaluation = self._evaluation
@@ -178,25 +197,25 @@ class Stepper(Dynamics):
         rows = states.shape[0]
         given = vars(u)
         columns = [given[name].expand(rows) for name in evaluation.inputs]
-        # forces are 0 for a caller that has none
-        columns += [given[name].expand(rows) if name in given else states.new_zeros(rows) for name in self.forces]
+        # forces and changes of constants are 0 for a caller that has none
+        columns += [given[name].expand(rows) if name in given else states.new_zeros(rows) for name in self._added]
         inputs = torch.stack(columns, -1) if columns else states.new_zeros(rows, 0)
         known = [getattr(p, name) for name in evaluation.parameters]
         parameters = torch.stack(known) if known else states.new_zeros(0)
         return evaluated(evaluation, outputs, time.expand(rows), states, inputs, parameters)
 
 
-def _with_forces(recording: Recording, stepper: Stepper) -> Recording:
-    """The recording with a column of zeros for each force."""
+def _with_zeros(recording: Recording, stepper: Stepper, names: Sequence[str]) -> Recording:
+    """The recording with a column of zeros for each force and each constant."""
     # a prepared recording has them already
-    taken = [name for name in stepper.forces if name in recording and bool((recording[name] != 0.0).any())]
+    taken = [name for name in names if name in recording and bool((recording[name] != 0.0).any())]
     if taken:
         raise SimulationError(
-            f"{stepper.name}: the recording has a column `{taken[0]}`, the name of a force at which effects act; "
-            "rename the column, or make the recorded force an input."
+            f"{stepper.name}: the recording has a column `{taken[0]}`, the name of a force or a constant at which "
+            "effects act; rename the column, or make the recorded quantity an input."
         )
-    zeros = {name: torch.zeros(len(recording), dtype=torch.float64) for name in stepper.forces}
-    units = {name: stepper.units[name] for name in stepper.forces if name in stepper.units}
+    zeros = {name: torch.zeros(len(recording), dtype=torch.float64) for name in names}
+    units = {name: stepper.units[name] for name in names if name in stepper.units}
     return Recording(
         {**recording.columns, **zeros},
         name=recording.name,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -14,7 +16,11 @@ _OF_ACTUATORS = {"actuator_gainprm": "gainprm", "actuator_biasprm": "biasprm"}
 
 
 def corrected_xml(
-    description: Description, values: Mapping[str, float], added: Mapping[tuple[str, str], float], note: str = ""
+    description: Description,
+    values: Mapping[str, float],
+    added: Mapping[tuple[str, str], float],
+    changed: Mapping[str, float] = MappingProxyType({}),
+    note: str = "",
 ) -> str:
     """Return the model as MJCF with other numbers.
 
@@ -22,6 +28,7 @@ def corrected_xml(
         description: the model.
         values: fitted number by parameter name.
         added: joint and attribute, ("elbow", "frictionloss") say, to what is added to the attribute, in its unit.
+        changed: change of a constant by its name.
         note: appended to the comment at the top of the file.
 
     Where files of meshes are missing, the parts that only are seen are left out.
@@ -51,6 +58,11 @@ def corrected_xml(
     for (joint, attribute), amount in added.items():
         part = spec.joints[joints.index(joint)]
         _set(part, attribute, _linear(getattr(part, attribute)) + amount)
+    other = copy.copy(description.model)
+    for name, change in changed.items():
+        constant = description.constants[name]
+        constant.write(other, constant.parameter.value + change, description.model)
+        constant.write_to_spec(spec, other)
     if note:
         spec.comment = f"{spec.comment} {note}".strip()
     try:

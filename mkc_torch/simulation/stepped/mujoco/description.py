@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mkc_torch.simulation.parameter import Parameter, SimulationError
+from mkc_torch.simulation.stepped.mujoco.constants import Constant, constants_of
 from mkc_torch.simulation.stepped.mujoco.numbers import Number, numbers_of
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ class Description:
         forces: force at each joint, to the joint's speed.
         sensors: name of a sensor's value, to its place in MuJoCo's ``sensordata``.
         numbers: numbers of the model that are fitted, by parameter name.
+        constants: numbers of which an effect may find that they differ, by name.
         units: by state, input, force and sensor.
         initial: value of each state at the model's initial configuration.
         fitted: the patterns that chose the numbers; None for the default.
@@ -47,6 +49,7 @@ class Description:
     forces: Mapping[str, str]
     sensors: Mapping[str, int]
     numbers: Mapping[str, Number]
+    constants: Mapping[str, Constant]
     units: Mapping[str, str]
     initial: Mapping[str, float]
     fitted: tuple[str, ...] | None
@@ -107,6 +110,8 @@ def described(path: Path, fitted: Sequence[str] | None) -> Description:
     for k, name in enumerate(controls):
         if (unit := _unit_of_control(model, k, units, joints)) is not None:
             units[name] = unit
+    numbers = numbers_of(model, joints, hinges, actuators, fitted)
+    bodies = [_identifier(_name(model, mujoco.mjtObj.mjOBJ_BODY, k) or f"body{k}") for k in range(model.nbody)]
     first = mujoco.MjData(model)
     values = [*first.qpos, *first.qvel, *first.act]
     return Description(
@@ -118,7 +123,8 @@ def described(path: Path, fitted: Sequence[str] | None) -> Description:
         dict(zip(joints, speeds, strict=True)),
         forces,
         {name: place for name, place in _sensors(model).items() if name not in names},
-        numbers_of(model, joints, hinges, actuators, fitted),
+        numbers,
+        constants_of(model, joints, hinges, bodies, (*names, *forces, *numbers)),
         units,
         dict(zip(states, map(float, values), strict=True)),
         None if fitted is None else tuple(fitted),

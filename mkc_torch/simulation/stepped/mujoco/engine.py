@@ -41,6 +41,7 @@ class Engine:
         # a state that diverges stays as it is, and is returned as NaN
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self._pools: dict[int, tuple[Any, list[Any]]] = {}
+        self._constants = tuple(known.parameter.value for known in description.constants.values())
         self._size = mujoco.mj_stateSize(self.model, _STATE)
 
     def stepped(self, x: Array, u: Array, tau: Array, parameters: Mapping[str, float]) -> tuple[Array, Array]:
@@ -66,6 +67,7 @@ class Engine:
         """States (B, T, n) and ``sensordata`` (B, T, s) over T steps with controls (B, T, c)."""
         for name, number in self.description.numbers.items():
             number.write(self.model, parameters[name])
+        self._set_constants(parameters)
         usable = _usable(x) & _usable(control).all(1)
         rows, n = len(x), x.shape[1]
         initial = np.zeros((rows, self._size))
@@ -83,6 +85,16 @@ class Engine:
         found = after[:, :, 1 : 1 + n].copy()
         found[~(usable[:, None] & _usable(found))] = np.nan
         return found, np.where(usable[:, None, None], sensed, np.nan)
+
+    def _set_constants(self, parameters: Mapping[str, float]) -> None:
+        """Write the constants, as in the file where they are not given, and what MuJoCo derives from them."""
+        known = self.description.constants
+        values = tuple(parameters.get(name, constant.parameter.value) for name, constant in known.items())
+        if values != self._constants:
+            for constant, value in zip(known.values(), values, strict=True):
+                constant.write(self.model, value, self.description.model)
+            mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+            self._constants = values
 
     @property
     def _pool(self) -> tuple[Any, list[Any]]:

@@ -142,6 +142,7 @@ def _class_of(found: Description) -> type[MujocoStepper]:
         "positions": found.positions,
         "forces": found.forces,
         "parameters": found.parameters,
+        "constants": {name: constant.parameter for name, constant in found.constants.items()},
         "units": found.units,
         "initial": found.initial,
         "time_step": found.time_step,
