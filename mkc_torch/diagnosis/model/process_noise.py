@@ -20,9 +20,11 @@ from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.diagnosis.thresholds import HOLD
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.first_fit import multiple_shooting_start, with_strong_observer
+from mkc_torch.simulation.dynamics.first_observed import first_observed
 from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, most_likely_noise
 from mkc_torch.simulation.dynamics.other_starts import other_starts
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+from mkc_torch.simulation.ports import Nearby
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
@@ -298,7 +300,8 @@ def under_noise(
     for _ in range(_ROUNDS):
         if noise is None:
             break
-        model = JointModel(fit.model.prepared.observed(noise.observer), fit.model.terms, fit.model.near)
+        near = _along(fit, noise)
+        model = JointModel(fit.model.prepared.observed(noise.observer), fit.model.terms, near)
         try:
             # the open-loop trajectory may be far from that along the observer
             fit = fitted(model, fit.parameters, fit.bound, graduate=False, fresh=True)
@@ -311,6 +314,15 @@ def under_noise(
         if noise is not None and noise.observer is None and under.observer is None:
             break
     return best
+
+
+def _along(fit: FittedModel, noise: StateSpaceNoise) -> Nearby | None:
+    """Return a start of the trajectory along an observer, from that of a fit in open loop."""
+    model, system = fit.model, fit.model.prepared.dynamics
+    if system is None or system.observer is not None or noise.observer is None:
+        return model.near
+    theta, changes = fit.parameters[: model.base], model.changes(fit.parameters)
+    return first_observed(system, theta, changes, model.near, noise.observer) or model.near
 
 
 def _from_short(

@@ -351,7 +351,7 @@ def transition_matrices(
     """Derivatives of the next states by the states just after a grid time, and by the interval's negative defect."""
     n = states.shape[1]
     eye = torch.eye(n, dtype=states.dtype, device=states.device)
-    slope = slopes(rate, stations(rate, states, grid, jump).detach())
+    slope = slopes(rate, stations(rate, states, grid, jump).detach(), at_once=grid.map_step is not None)
     left, middle, right = _ends(slope)
     h = grid.step.unsqueeze(-1).unsqueeze(-1)
     if grid.map_step is not None:
@@ -371,12 +371,13 @@ def _recurrence(rate: Rate, states: Float[Tensor, "G n"], grid: Grid, jump: Jump
     return Recurrence.of(carries, inverse, grid.longest)
 
 
-def slopes(rate: Rate, at: Float[Tensor, "S n"]) -> Float[Tensor, "S k n"]:
+def slopes(rate: Rate, at: Float[Tensor, "S n"], *, at_once: bool = False) -> Float[Tensor, "S k n"]:
     """Jacobian of the rates by the states of their own station, without a gradient of its own.
 
     Reverse mode is used outside of function transforms. It is cheaper than forward mode, which propagates the zero
     tangents of every constant. Forward mode is the fallback where the Jacobian is not finite, since reverse mode
-    multiplies an infinite slope in the unused branch of ``torch.where`` by 0.
+    multiplies an infinite slope in the unused branch of ``torch.where`` by 0. ``at_once`` propagates all rows back
+    together, for rates of few operations, each of which torch can do for a batch.
     """
     with torch.enable_grad():
         given = at.requires_grad_() if not is_wrapped(at) else at
@@ -385,13 +386,20 @@ def slopes(rate: Rate, at: Float[Tensor, "S n"]) -> Float[Tensor, "S k n"]:
             n = rates.shape[1]
             if not rates.requires_grad:
                 return at.new_zeros(len(at), n, at.shape[1])
-            rows = [
-                torch.autograd.grad(
-                    values.sum(), given, retain_graph=k + 1 < n, allow_unused=True, materialize_grads=True
-                )[0]
-                for k, values in enumerate(rates.unbind(-1))
-            ]
-            slope = torch.stack(rows, 1)
+            each = torch.eye(n, dtype=at.dtype, device=at.device).unsqueeze(1).expand(n, len(at), n)
+            if at_once:
+                (found,) = torch.autograd.grad(
+                    rates, given, each, is_grads_batched=True, allow_unused=True, materialize_grads=True
+                )
+                slope = found.movedim(0, 1)
+            else:
+                rows = [
+                    torch.autograd.grad(
+                        rates, given, row, retain_graph=k + 1 < n, allow_unused=True, materialize_grads=True
+                    )[0]
+                    for k, row in enumerate(each)
+                ]
+                slope = torch.stack(rows, 1)
             if bool(slope.isfinite().all()):
                 return slope
     load_forward_mode()

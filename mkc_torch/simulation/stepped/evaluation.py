@@ -91,11 +91,12 @@ class StepperEvaluation(CachedEvaluation):
     def _with_constants(self, outputs: bool, states: Array, given: Array, parameters: Array) -> Array:
         """The values at states and inputs; one call for all points with the same constants."""
         named = dict(zip(self.parameters, parameters.tolist(), strict=True))
-        if not self.constants:
-            return self._at(outputs, states, given, Names(**named))
         first = given.shape[1] - len(self.constants)
-        found = np.full((len(states), self.count(outputs)), np.nan)
-        different, group = np.unique(given[:, first:], axis=0, return_inverse=True)
+        found, changes = np.full((len(states), self.count(outputs)), np.nan), given[:, first:]
+        if (changes == changes[:1]).all():  # nearly always; sorting them costs as much as the steps
+            different, group = changes[:1], np.zeros(len(changes), dtype=int)
+        else:
+            different, group = np.unique(changes, axis=0, return_inverse=True)
         for k, change in enumerate(different):
             rows, constants = group.reshape(-1) == k, self.changed(change)
             if constants is not None:
