@@ -110,7 +110,7 @@ def test_ids_are_unchanged():
         "thermal_loss", "input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlash", "bouc_wen_hysteresis",
         "added_mass", "magnus_lift", "buoyancy", "hidden_lag", "hidden_mode", "power_law", "input_lag", "input_square",
         "driver_force", "driver_exchange", "driver_rate_constant", "driver_input_gain",
-        "driver_parameter", "driver_parameter_quadratic", "driver_parameter_arrhenius",
+        "driver_parameter", "driver_parameter_quadratic", "driver_parameter_arrhenius", "constant_change",
         "driver_output", "driver_output_quadratic", "driver_output_lagged", "periodic_rate", "periodic_output",
     }  # fmt: skip
     assert (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED) == CATALOGUE

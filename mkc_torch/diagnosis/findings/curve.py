@@ -141,4 +141,4 @@ def places_of(term: Term, channels: Sequence[str]) -> tuple[str, ...]:
     if "rate of " in term.at or term.at.startswith("exchange of "):
         return tuple(f"rate of {name}" for name in channels)
     kind = "input" if term.at.startswith("entry of ") else term.at.partition(" ")[0]
-    return tuple(f"{kind} {name}" if kind in ("input", "parameter") else name for name in channels)
+    return tuple(f"{kind} {name}" if kind in ("input", "parameter", "constant") else name for name in channels)

@@ -144,6 +144,7 @@ class StepperEvaluation(CachedEvaluation):
             )
         return np.asarray((after - states) / stepper.time_step)
 
+
 def _moved(values: Array, place: int, step: float) -> Array:
     """A copy with a step added to the values at one place of the first axis."""
     found = values.copy()

@@ -60,6 +60,7 @@ NEVER_HIDDEN = {
     "added_mass": "every plant's own parameters scale all its forces, or there is none but gravity",
     "buoyancy": "no plant has a height of either sign",
     "gain": "the joint's scale is fitted",
+    "constant_change": "no plant steps; `tests.simulation.stepped.test_constants` hides it",
     "clock_drift": "no plant has a clock of its own",
     "sensor_clock_drift": "as for clocks of paired data; `tests.diagnosis.test_clocks` hides it",
     "driver_linear": "no plant has a driver that is recorded and is no input",
