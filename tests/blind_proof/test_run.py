@@ -65,7 +65,7 @@ def correct_stub(model, path):
 
 @pytest.fixture(
     scope="module",
-    params=[*list(PROOFS)[:3], pytest.param("equations_scenarios", marks=pytest.mark.e2e)],
+    params=[*list(PROOFS)[:3], pytest.param("equations_scenarios", marks=pytest.mark.slow)],
 )
 def run(request, tmp_path_factory):
     output = tmp_path_factory.mktemp("proof") / "out"
@@ -195,7 +195,7 @@ def test_a_larger_run_of_scenarios_contains_a_smaller_one(tmp_path):
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("name", ["magnetometer", "equations_scenarios"])
+@pytest.mark.parametrize("name", ["magnetometer", pytest.param("equations_scenarios", marks=pytest.mark.slow)])
 def test_draws_do_not_depend_on_the_number_of_processes(name, tmp_path):
     proof = PROOFS[name].only([] if name == "magnetometer" else ["gusts", "useless"])
     for workers in (1, 2):

@@ -192,9 +192,8 @@ def test_two_tanks_have_a_good_fit():
     assert diagnosis.verdict in ("explained", "unexplained")
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("stiff_240", marks=pytest.mark.e2e), pytest.param("resonant_600", marks=slow)]
-)
+@slow
+@pytest.mark.parametrize("name", ["stiff_240", "resonant_600"])
 def test_a_load_on_a_flexible_shaft_is_a_hidden_mode(name):
     diagnosis = diagnosed(f"two_mass/{name}.csv", "two_mass/naive.py:Drive")
     assert diagnosis.verdict == "explained"

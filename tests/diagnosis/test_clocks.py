@@ -9,7 +9,7 @@ from tests.diagnosis.clocks import STEP, Stage, stage_recording
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("rate", [0.006, -0.006])
+@pytest.mark.parametrize("rate", [0.006, pytest.param(-0.006, marks=pytest.mark.slow)])
 def test_a_clock_of_another_rate_is_found_with_its_rate(rate):
     found = diagnose(Stage(), stage_recording(1, rate=rate), surrogates=19, max_findings=1)
     [finding] = found.findings

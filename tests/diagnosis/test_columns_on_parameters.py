@@ -97,10 +97,14 @@ HIDDEN = {
     ),
     "driver_output_lagged": (cart, {"more": lambda away, time: 0.2 * lagged(away, time, 8.0)}, "speed", (0.2, 8.0)),
 }
+USUAL = ("driver_parameter", "driver_output")
+"""Effects of which every run of the tests diagnoses a recording."""
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("effect", list(HIDDEN))
+@pytest.mark.parametrize(
+    "effect", [name if name in USUAL else pytest.param(name, marks=pytest.mark.slow) for name in HIDDEN]
+)
 def test_a_column_that_acts_is_named_with_its_place_and_size(effect):
     make, how, place, sizes = HIDDEN[effect]
     result = diagnose(Cart(), make(7, **how), max_findings=2, surrogates=39)

@@ -11,7 +11,7 @@ SIZES = {"driver_force": 0.15, "driver_exchange": 0.02, "driver_rate_constant": 
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("effect", EFFECTS)
+@pytest.mark.parametrize("effect", [EFFECTS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in EFFECTS[1:])])
 def test_a_recorded_cause_is_named_with_its_column_and_size(effect):
     column, size = COLUMN_OF.get(effect, "sun"), SIZES[effect]
     found = diagnose(Body(), recording(HiddenCause(effect, column, size), "white", 4), max_findings=2)

@@ -48,7 +48,13 @@ def diagnosed(friction: float, second: float, metre: float) -> Diagnosis:
     return diagnose(Mass(), Recording(columns), effects=effects, surrogates=19)
 
 
-SCALES = [(1e-6, 1.0), (3e7, 1.0), (1.0, 1e-9), (1.0, 1e9), (1e-6, 1e9)]
+SCALES = [
+    pytest.param(1e-6, 1.0, marks=pytest.mark.slow),
+    (3e7, 1.0),
+    (1.0, 1e-9),
+    pytest.param(1.0, 1e9, marks=pytest.mark.slow),
+    pytest.param(1e-6, 1e9, marks=pytest.mark.slow),
+]
 
 
 @pytest.mark.e2e

@@ -28,6 +28,9 @@ EXPECTED_FINDINGS = {
 }
 """First findings of the diagnoses of a page, by the name of the diagnosis in the page."""
 
+LONG = ("measured",)
+"""Pages of commands that other tests run as well, in a smaller version."""
+
 PACKAGES_OF_PAGES = {"large_data": "pyarrow", "own_simulation": "fmpy", "mujoco": "mujoco"}
 """Packages that a page needs in addition to those of all pages."""
 
@@ -52,7 +55,10 @@ def folder(examples, tmp_path, monkeypatch):
 
 
 @pytest.mark.manual
-@pytest.mark.parametrize("page", PAGES_WITH_CODE, ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, id=page.stem, marks=[pytest.mark.slow] * (page.stem in LONG)) for page in PAGES_WITH_CODE],
+)
 def test_every_block_of_a_page_runs(page, folder):
     if page.stem in PACKAGES_OF_PAGES:
         pytest.importorskip(PACKAGES_OF_PAGES[page.stem])

@@ -66,8 +66,9 @@ def chain_of_line(beam: BeamSearch) -> list[list[Candidate]]:
 def _by_price(models: Sequence[Candidate], terms: Sequence[Term]) -> list[Candidate]:
     """Order models by price, at equal price first those to first order in their columns, then by score.
 
-    The same dependence on a column can have two names, as a loss and as the parameter of this loss. Of models of equal
-    price and score with the same columns, the name that is first in the catalogue comes first.
+    The same dependence on a column can have two names, as a loss and as the parameter of this loss; and a buoyancy
+    whose surface is above the whole motion is a constant force. Of models of equal price and score with the same
+    columns, that with the fewest shapes comes first, and then the name that is first in the catalogue.
     """
 
     def price(model: Candidate) -> tuple[float, int]:
@@ -76,16 +77,17 @@ def _by_price(models: Sequence[Candidate], terms: Sequence[Term]) -> list[Candid
     def columns(model: Candidate) -> list[tuple[str, ...]]:
         return sorted(term.columns for term in model.fit.model.terms)
 
-    def place(model: Candidate) -> list[int]:
+    def place(model: Candidate) -> tuple[int, list[int]]:
         own = {term.key for term in model.fit.model.terms}
-        return sorted(number for number, term in enumerate(terms) if term.key in own)
+        shapes = sum(len(term.shape) for term in model.fit.model.terms)
+        return shapes, sorted(number for number, term in enumerate(terms) if term.key in own)
 
     ordered = sorted(models, key=price)
     for number, model in enumerate(ordered):
         same = [
             other
             for other in ordered[number:]
-            if price(other) == price(model) and columns(other) == columns(model) and any(columns(model))
+            if price(other) == price(model) and columns(other) == columns(model)
             if abs(other.value - model.value) < _SAME_SCORE
         ]
         if same:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
 import torch
@@ -140,6 +141,10 @@ def _interval(over: float, under: float, deviations: Sequence[Sequence[float]]) 
         return Ratio(value, value, value)
     # Welch, Biometrika 34 (1947), 28; for one group, its number less 1
     freedom = variance**2 / sum(part**2 / (count - 1.0) for count, part in parts)
-    quantile = float(student_quantile(1.0 - LEVEL, torch.tensor(freedom)))
-    reach = 0.5 * quantile * math.sqrt(variance)
+    reach = 0.5 * _quantile(freedom) * math.sqrt(variance)
     return Ratio(value, value * math.exp(-reach), value * math.exp(reach))
+
+
+@cache  # a bisection, and the outputs of a recording have as many blocks as each other
+def _quantile(freedom: float) -> float:
+    return float(student_quantile(1.0 - LEVEL, torch.tensor(freedom)))

@@ -184,7 +184,7 @@ def test_far_starts_are_ten_times_off(index, tmp_path):
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("index", range(6))
+@pytest.mark.parametrize("index", [0, 1, 2, *(pytest.param(index, marks=pytest.mark.slow) for index in (3, 4, 5))])
 def test_a_useless_simulation_fits_no_output_of_the_recording(index):
     """A fit to the recorded outputs from other starts does not explain a quarter of any output either."""
     case = SCENARIOS["useless"].draw(5, index, False, index)

@@ -28,6 +28,7 @@ STAGES = {
     "run_tests": "running the tests of evidence",
     "build_result": "describing the result",
 }
+LATER = ("estimate", "run_tests")
 MODULES = [
     module
     for info in pkgutil.walk_packages(mkc_torch.diagnosis.__path__, "mkc_torch.diagnosis.")
@@ -64,7 +65,9 @@ ALL = {"diagnosis.json", "model.json", "corrected.py", "report.html"}
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize(
+    "stage", ["stepwise_search", "build_result", *(pytest.param(s, marks=pytest.mark.slow) for s in LATER)]
+)
 def test_an_error_of_a_stage_leaves_the_result_so_far(folder, tmp_path, monkeypatch, stage):
     monkeypatch.setattr(importlib.import_module("mkc_torch.diagnosis.diagnose"), stage, broken)
     result, content = diagnosed(folder, tmp_path)
@@ -108,8 +111,8 @@ def test_an_error_of_any_optional_step_leaves_all_files(folder, tmp_path, monkey
     ("name", "function"),
     [
         ("diagnosis.json", "mkc_torch.diagnosis.io.diagnosis_json.diagnosis_to_json"),
-        ("model.json", "mkc_torch.diagnosis.DiagnosedModel.to_json"),
-        ("corrected.py", "mkc_torch.diagnosis.DiagnosedModel.to_python"),
+        pytest.param("model.json", "mkc_torch.diagnosis.DiagnosedModel.to_json", marks=pytest.mark.slow),
+        pytest.param("corrected.py", "mkc_torch.diagnosis.DiagnosedModel.to_python", marks=pytest.mark.slow),
         ("report.html", "mkc_torch.report.diagnosis_report"),
     ],
 )

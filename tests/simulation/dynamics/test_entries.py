@@ -120,7 +120,7 @@ def rolled(seed: int, friction: float, tilt: float = 0.0, noise: float = 0.002) 
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_friction_of_a_cart_is_found_at_the_force_and_exported(seed: int, tmp_path) -> None:
     recording = rolled(seed, friction=0.3)
     found = diagnose(Cart(), recording, effects=(CoulombFriction(),), surrogates=39, max_findings=1)

@@ -184,7 +184,10 @@ CANDIDATES = (CoulombFriction(), QuadraticDrag(), InputDelay(), ConstantForce())
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(kind, id=name, marks=[pytest.mark.slow] * (kind != "rates")) for name, kind in KINDS.items()],
+)
 class TestDiagnosesWithMissingOutputs:
     def test_hidden_friction_is_found_with_the_size_of_an_independent_fit(self, kind):
         system, recording, outputs = recorded(kind, 1, 0.05)

@@ -160,6 +160,7 @@ def test_the_first_finding_of_the_steering_compass_is_the_heading_reset():
 
 
 @pytest.mark.e2e
+@pytest.mark.slow
 def test_a_quadrotors_current_is_found_next_to_its_heading_jumps():
     recording = Recording.read(shared_data("magnetometer/quadrotor_compass3.csv"))
     result = diagnose(Magnetometer(), recording)
