@@ -1,0 +1,222 @@
+"""How often effects that MuJoCo's own elements make are named at the right joint, with the right size.
+
+``python -m tests.gate.each_joint_effect --per-effect 5 --output DIR`` steps an arm of two links with five times finer
+steps than its file says and with one element more, adds an encoder's resolution, noise and outliers, and diagnoses the
+recordings with the file. A diagnosis that the folder has is not repeated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from subprocess import run
+from typing import Any
+
+import numpy as np
+import torch
+
+from mkc_torch.recording.recording import write_table
+
+ARM = """
+<mujoco model="arm">
+  <compiler angle="radian"/>
+  <option timestep="0.005" integrator="implicitfast"/>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <joint name="shoulder" type="hinge" axis="0 1 0" damping="0.2"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="1" contype="0" conaffinity="0"/>
+      <body name="fore" pos="0 0 -0.4">
+        <joint name="elbow" type="hinge" axis="0 1 0" damping="0.1"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.5" contype="0" conaffinity="0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="first" joint="shoulder"/><motor name="second" joint="elbow"/></actuator>
+</mujoco>
+"""
+"""The arm as its file has it."""
+
+FINER = 5
+"""Steps of the recorded arm in a step of the file."""
+
+SAMPLES, SAMPLE_S = 300, 0.02
+NOISE_RAD, ENCODER_BITS, OUTLIERS = 0.001, 13, 0.02
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """An element that the file lacks.
+
+    Attributes:
+        effect: id of the effect that it is.
+        channel: where it acts, as findings state it.
+        sizes: smallest and largest size that is drawn, in the unit of the finding.
+        parameter: name of the finding's parameter that is the size.
+        write: adds it to MuJoCo's specification; the second argument is the size.
+    """
+
+    effect: str
+    channel: str
+    sizes: tuple[float, float]
+    parameter: str
+    write: Callable[[Any, float], None]
+
+
+def _friction(spec: Any, size: float) -> None:
+    spec.joint("elbow").frictionloss = size
+
+
+def _stop(spec: Any, size: float) -> None:
+    import mujoco
+
+    spec.joint("elbow").limited = mujoco.mjtLimited.mjLIMITED_TRUE
+    spec.joint("elbow").range = [-size, 10.0]
+
+
+def _lag(spec: Any, size: float) -> None:
+    import mujoco
+
+    spec.actuator("second").dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
+    spec.actuator("second").dynprm[0] = size
+
+
+def _limit(spec: Any, size: float) -> None:
+    import mujoco
+
+    spec.actuator("first").ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
+    spec.actuator("first").ctrlrange = [-size, size]
+
+
+def _load(spec: Any, size: float) -> None:
+    import mujoco
+
+    load = spec.body("fore").add_geom()
+    load.type, load.size, load.mass = mujoco.mjtGeom.mjGEOM_SPHERE, [0.001, 0.0, 0.0], size
+    load.pos, load.contype, load.conaffinity = [0.0, 0.0, -0.15], 0, 0
+
+
+def _length(spec: Any, size: float) -> None:
+    spec.body("fore").pos = [0.0, 0.0, -0.4 - size]
+
+
+def _tilt(spec: Any, size: float) -> None:
+    spec.option.gravity = [9.81 * np.sin(size), 0.0, -9.81 * np.cos(size)]
+
+
+def _zero(spec: Any, size: float) -> None:
+    spec.joint("elbow").ref = size
+
+
+def _inertia(spec: Any, size: float) -> None:
+    spec.joint("elbow").armature = size
+
+
+HIDDEN: Mapping[str, Hidden] = {
+    "friction": Hidden("coulomb_friction", "input elbow_force", (0.03, 0.08), "friction", _friction),
+    "stop": Hidden("hard_stop", "input elbow_force", (0.3, 0.5), "", _stop),
+    "lag": Hidden("input_lag", "input second", (0.03, 0.08), "lag", _lag),
+    "limit": Hidden("input_saturation", "input first", (1.2, 1.8), "limit", _limit),
+    "load": Hidden("constant_change", "constant fore_mass", (0.05, 0.15), "change", _load),
+    "length": Hidden("constant_change", "constant fore_distance", (0.02, 0.06), "change", _length),
+    "tilt": Hidden("constant_change", "constant base_tilt_x", (0.03, 0.1), "change", _tilt),
+    "zero": Hidden("constant_change", "constant elbow_ref", (0.05, 0.15), "change", _zero),
+    "inertia": Hidden("constant_change", "constant elbow_armature", (0.003, 0.01), "change", _inertia),
+}
+
+
+def recorded(kind: str, index: int, seed: int) -> tuple[float, dict[str, torch.Tensor]]:
+    """Draw a size, and return it with the columns of a recording.
+
+    Args:
+        kind: name in ``HIDDEN``.
+        index: number of the recording.
+        seed: of all draws.
+    """
+    import mujoco
+
+    random = np.random.default_rng([seed, list(HIDDEN).index(kind), index])
+    size = float(random.uniform(*HIDDEN[kind].sizes))
+    spec = mujoco.MjSpec.from_string(ARM)
+    HIDDEN[kind].write(spec, size)
+    spec.option.timestep /= FINER
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    time = SAMPLE_S * np.arange(SAMPLES)
+    phase, speed = random.uniform(0.0, 6.0, (2, 2)), random.uniform(0.8, 1.2, (2, 2))
+    slow, fast = np.sin(2.0 * speed[0] * time[:, None] + phase[0]), np.sin(5.5 * speed[1] * time[:, None] + phase[1])
+    control = np.array([2.0, 0.3]) * slow + np.array([1.2, 0.25]) * fast
+    angles = np.empty((SAMPLES, 2))
+    for row in range(SAMPLES):
+        angles[row] = data.qpos[:2]
+        data.ctrl[:] = control[row]
+        mujoco.mj_step(model, data, round(SAMPLE_S / model.opt.timestep))
+    digit = 2.0 * np.pi / 2**ENCODER_BITS
+    shown = digit * np.round((angles + NOISE_RAD * random.normal(size=angles.shape)) / digit)
+    wrong = random.random(angles.shape) < OUTLIERS
+    shown = np.where(wrong, shown + random.uniform(-1.0, 1.0, angles.shape), shown)
+    columns = {"time": time, "first": control[:, 0], "second": control[:, 1]}
+    columns |= {"shoulder": shown[:, 0], "elbow": shown[:, 1]}
+    return size, {name: torch.tensor(values) for name, values in columns.items()}
+
+
+def judged(content: Mapping[str, Any], hidden: Hidden, size: float) -> tuple[bool, str]:
+    """Return whether the first finding is the hidden element, and a text with its size.
+
+    Args:
+        content: of ``diagnosis.json``.
+        hidden: the element.
+        size: its size.
+    """
+    findings = content["findings"]
+    if not findings:
+        return False, f"{content['verdict']}: no name"
+    first = findings[0]
+    right = first["effect"] == hidden.effect and hidden.channel in first["channels"]
+    sizes = [p for p in first["parameters"] if p["name"] == hidden.parameter]
+    text = f"{first['effect']} at {', '.join(first['channels'])}"
+    if not sizes:
+        return right, text
+    value, error = (float(np.ravel(sizes[0][key])[0]) for key in ("value", "standard_error"))
+    return right, f"{text}, {value:.4g} ± {error:.2g}, true {size:.4g}, off by {abs(value - size) / error:.1f} errors"
+
+
+def measure(kinds: Sequence[str], per_effect: int, seed: int, output: Path, options: Sequence[str]) -> None:
+    """Draw, diagnose, and print a line for each recording and each element."""
+    output.mkdir(parents=True, exist_ok=True)
+    (output / "arm.xml").write_text(ARM, encoding="utf-8")
+    totals = dict.fromkeys(kinds, 0)
+    for kind in kinds:
+        for index in range(per_effect):
+            name = f"{kind}_{index}"
+            size, columns = recorded(kind, index, seed)
+            file = output / name / "diagnosis.json"
+            if not file.is_file():
+                write_table(output / f"{name}.csv", columns)
+                files = [str(output / f"{name}.csv"), "--simulation", str(output / "arm.xml"), "--output", str(output)]
+                run([sys.executable, "-m", "mkc_torch.cli", "diagnose", *files, "--force", *options], check=False)
+            right, text = judged(json.loads(file.read_text(encoding="utf-8")), HIDDEN[kind], size)
+            totals[kind] += right
+            print(f"{name} | {'right' if right else 'WRONG'} | {text}", flush=True)
+    print("\n| element | named right |\n|---|---:|")
+    for kind, right in totals.items():
+        print(f"| {kind} | {right} of {per_effect} |")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--elements", nargs="+", choices=list(HIDDEN), default=list(HIDDEN), metavar="NAME")
+    parser.add_argument("--per-effect", type=int, default=5, help="recordings of each element (default: 5)")
+    parser.add_argument("--seed", type=int, default=21)
+    parser.add_argument("--output", type=Path, required=True, help="folder for recordings and diagnoses")
+    parser.add_argument("--whole", action="store_true", help="with p-values; default: a quick look")
+    options = parser.parse_args(arguments)
+    measure(options.elements, options.per_effect, options.seed, options.output, () if options.whole else ("--quick",))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
