@@ -6,7 +6,7 @@ Lentz's method, in float64 and without a gradient.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 
 import torch
 from torch import Tensor
@@ -14,8 +14,15 @@ from torch import Tensor
 _STEPS = 2000
 """Maximum number of terms of the continued fraction; twice the root of the larger parameter suffices."""
 
-_HALVINGS = 100
-"""Number of bisections for a quantile; many, because the root is close to 0 far in the tail."""
+_NEWTON = 100
+"""Largest number of Newton steps for a quantile; fewer than ten are usual, and more where few degrees of freedom have a
+quantile of many thousands."""
+
+_MOST = 0.7
+"""Largest increase of log t in a step, so that the tails do not underflow."""
+
+_SETTLED = 1e-14
+"""Change of log t in the last step."""
 
 _FREEDOM = 1e6
 """Limit of the degrees of freedom: beyond it quantiles are within 1e-6 of a Gaussian's."""
@@ -85,25 +92,25 @@ def fisher_tail(f: Tensor, over: Tensor, under: Tensor) -> Tensor:
 def student_quantile(level: float, freedom: Tensor) -> Tensor:
     """The t for which a Student t is within ±t with probability ``level``.
 
+    Newton's method for the logarithm of the tails as a function of log t, or of the rest if that is smaller. Both are
+    concave, so that the steps approach the root from one side.
+
     Example:
         >>> student_quantile(0.95, torch.tensor([10.0, 1e6]))
         tensor([2.2281, 1.9600], dtype=torch.float64)
     """
-    freedom = freedom.detach().double()
-    half = torch.full_like(freedom, 0.5)
-    a = 0.5 * freedom.clamp(max=_FREEDOM)
-    inside = _bisected(lambda x: incomplete_beta(half, a, x) > level, freedom)
-    # far in the tail, 1 − share loses the digits of the small rest
-    outside = _bisected(lambda x: incomplete_beta(a, half, x) > 1.0 - level, freedom)
-    near, far = inside / (1.0 - inside), (1.0 - outside) / outside
-    return torch.sqrt(2.0 * a * torch.where(inside > 0.5, far, near))
-
-
-def _bisected(above: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
-    """The point between 0 and 1 at which a condition becomes true, by bisection."""
-    low, high = torch.zeros_like(like), torch.ones_like(like)
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        over = above(middle)
-        low, high = torch.where(over, low, middle), torch.where(over, middle, high)
-    return 0.5 * (low + high)
+    freedom = freedom.detach().double().clamp(max=_FREEDOM)
+    log_density = torch.lgamma(0.5 * freedom + 0.5) - torch.lgamma(0.5 * freedom) - 0.5 * torch.log(torch.pi * freedom)
+    log_t, half = torch.zeros_like(freedom), torch.full_like(freedom, 0.5)
+    goal, sign = (math.log1p(-level), 1.0) if level > 0.5 else (math.log(level), -1.0)
+    for _ in range(_NEWTON):
+        t = torch.exp(log_t)
+        square = t.square()
+        share, a, b = (freedom, 0.5 * freedom, half) if level > 0.5 else (square, half, 0.5 * freedom)
+        found = incomplete_beta(a, b, share / (freedom + square))
+        log_slope = log_density + log_t - (0.5 * freedom + 0.5) * torch.log1p(square / freedom)
+        change = sign * (torch.log(found) - goal) * found / (2.0 * torch.exp(log_slope))
+        log_t = log_t + change.clamp(max=_MOST)
+        if bool((change.abs() < _SETTLED).all()):
+            break
+    return torch.exp(log_t)
