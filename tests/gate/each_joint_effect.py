@@ -1,7 +1,7 @@
 """How often effects that MuJoCo's own elements make are named at the right joint, with the right size.
 
 ``python -m tests.gate.each_joint_effect --per-effect 5 --output DIR`` steps an arm of two links with five times finer
-steps than its file says and with one element more, adds an encoder's resolution, noise and outliers, and diagnoses the
+steps than its file has and with one element more, adds an encoder's resolution, noise and outliers, and diagnoses the
 recordings with the file. A diagnosis that the folder has is not repeated.
 """
 

@@ -131,6 +131,15 @@ def test_the_disturbance_has_a_picture_after_the_residual_with_size_and_correlat
     assert "no missing physics" not in text
 
 
+def test_a_quick_look_leaves_open_whether_a_finding_explains_the_process_noise():
+    untested = dataclasses.replace(make_diagnosis(1, samples=50).findings[0], grade="unconfirmed", evidence=())
+    look = dataclasses.replace(disturbed(), quick=True, findings=(untested,))
+    sentence = top.headline(look)
+    assert sentence.startswith("The simulation alone has process noise on the rate of")
+    assert "a quick look does not test whether a finding explains it. Found, but not tested" in sentence
+    assert "no physics" not in sentence
+
+
 @pytest.mark.parametrize("samples", [1, 2, 5000])
 @pytest.mark.parametrize("curves", [0, 1, 12])
 def test_disturbances_of_any_length_and_number_of_curves_have_a_page(samples, curves):

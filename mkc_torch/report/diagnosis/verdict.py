@@ -106,6 +106,10 @@ _LEFT_OUT, _NEAREST = "Left out of the simulation: {findings}.", "Nearest in the
 _REFUSED = "Found, but not confirmed: {findings}."
 _CANNOT_BE = "Found, but of an impossible size: {findings}."
 _NOT_TESTED = f"Found, but {NOT_TESTED}: {{findings}}."
+_BEFORE = (
+    "The simulation alone has process noise on the rate of {places}; a quick look does not test whether a finding "
+    "explains it."
+)
 _SMALL, _UNCONFIRMED, _BOTH = (
     "Real, but small compared with the noise: {findings}.",
     "Found, but not confirmed on held-out blocks: {findings}.",
@@ -161,6 +165,8 @@ def unexplained(diagnosis: Diagnosis) -> str:
                 "A drift of {places} remains.",
             )
         )
+        if d.quick and d.findings and rates:
+            pair = (_BEFORE, pair[1])
         return pair[int(found)].format(places=several(places))
     if d.remaining:
         return (

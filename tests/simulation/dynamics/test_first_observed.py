@@ -28,20 +28,20 @@ class Pendulum(Spring):
         return {"place": x.speed, "speed": -p.stiffness * torch.sin(x.place) - 0.3 * x.speed}
 
 
-def pushed(lasting, force, seed=0, samples=160):
-    """Two runs of a pendulum or a spring that a random push moves."""
+def disturbed(lasting, force, seed=0, samples=160):
+    """Two runs of a pendulum or a spring that random forces move."""
     random, fine = np.random.default_rng(seed), 20
     time, places, runs = [], [], []
     for run in range(2):
-        place, speed, push = 1.0, 0.0, 0.0
+        place, speed, force_now = 1.0, 0.0, 0.0
         share = math.exp(-STEP / fine / lasting) if lasting else 0.0
         for row in range(samples):
             time.append(STEP * row)
             places.append(place + 0.01 * random.normal())
             runs.append(run)
             for _ in range(fine):
-                push = share * push + math.sqrt(1.0 - share**2) * random.normal() * (1.0 if lasting else 6.0)
-                speed += STEP / fine * (force(place) - 0.3 * speed + push)
+                force_now = share * force_now + math.sqrt(1.0 - share**2) * random.normal() * (1.0 if lasting else 6.0)
+                speed += STEP / fine * (force(place) - 0.3 * speed + force_now)
                 place += STEP / fine * speed
     columns = {"time": time, "place": places, "experiment": runs}
     return Recording({name: torch.tensor(np.array(values), dtype=torch.float64) for name, values in columns.items()})
@@ -49,7 +49,7 @@ def pushed(lasting, force, seed=0, samples=160):
 
 def observed(system, lasting, force):
     """The open loop, its observer, and the first guess along it."""
-    prepared = system.prepare(pushed(lasting, force))
+    prepared = system.prepare(disturbed(lasting, force))
     theta = prepared.start()
     near = prepared.trajectory(theta, {})
     found = most_likely_noise(prepared, theta, {}, near, declared={}, least=6.0, most=1, known=None)
@@ -59,7 +59,7 @@ def observed(system, lasting, force):
 
 
 def test_the_guess_for_linear_equations_is_the_solution():
-    prepared = Spring().prepare(pushed(0.0, lambda place: -4.0 * place))
+    prepared = Spring().prepare(disturbed(0.0, lambda place: -4.0 * place))
     theta = prepared.start()
     strong, near = with_strong_observer(prepared, theta, 10.0), prepared.trajectory(theta, {})
     assert not strong.observer.lasting
@@ -75,7 +75,7 @@ def test_the_guess_for_linear_equations_is_the_solution():
     (Spring, lambda place: -4.0 * place),
     (Pendulum, lambda place: -4.0 * math.sin(place)),
 ])  # fmt: skip
-def test_the_guess_is_near_the_solution_with_a_lasting_push(system, force):
+def test_the_guess_is_near_the_solution_with_a_lasting_disturbance(system, force):
     prepared, theta, _, observer, guess = observed(system(), 0.6, force)
     assert [disturbance.place for disturbance in observer.lasting] == ["speed"]
     assert guess.states.shape[1] == 3
