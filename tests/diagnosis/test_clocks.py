@@ -22,6 +22,7 @@ def test_a_clock_of_another_rate_is_found_with_its_rate(rate):
 
 
 @pytest.mark.e2e
+@pytest.mark.slow
 def test_a_constant_offset_of_the_clocks_is_no_drift():
     """The force acts three samples before its column shows it, which no effect of the catalogue names."""
     found = diagnose(Stage(), stage_recording(1, late=-3), surrogates=19, max_findings=1)

@@ -113,6 +113,7 @@ def test_a_drivers_dead_zone_acts_before_the_motors_lag():
 
 
 @pytest.mark.e2e
+@pytest.mark.slow
 def test_the_code_of_a_drivers_dead_zone_acts_before_that_of_the_motors_lag():
     diagnosis = diagnose(Motor(), motor(), effects=(DeadZone(), InputLag()), **QUICK)
     assert {finding.effect for finding in diagnosis.findings} == {"dead_zone", "input_lag"}

@@ -208,7 +208,8 @@ def test_nothing_is_named_where_nothing_is_missing(seed):
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize(("frictions", "seed"), [pytest.param((0.3, 0.9), 1, marks=pytest.mark.slow), ((0.5, 0.5), 2)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("frictions", "seed"), [((0.3, 0.9), 1), ((0.5, 0.5), 2)])
 def test_dry_friction_of_a_pendulum_has_a_common_size_only_where_it_is_equal(frictions, seed):
     recordings = [swing(friction, seed + 100 * k, "AB"[k]) for k, friction in enumerate(frictions)]
     names = ("coulomb_friction", "stribeck_friction", "linear_drag", "constant_force", "input_lag")

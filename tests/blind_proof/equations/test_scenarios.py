@@ -51,7 +51,9 @@ def test_the_same_address_gives_the_same_case_under_another_number(name):
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "useless")) for name in SCENARIOS]
+)
 def test_nothing_is_hidden_in_an_empty_case(name):
     for index in range(3):
         key = SCENARIOS[name].draw(3, index, False, index).key
@@ -129,7 +131,9 @@ def recorded_runs(recording):
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize(("name", "runs"), [("lasting_push", 1), ("lasting_push_runs", 4)])
+@pytest.mark.parametrize(
+    ("name", "runs"), [pytest.param("lasting_push", 1, marks=pytest.mark.slow), ("lasting_push_runs", 4)]
+)
 @pytest.mark.parametrize("hidden", [False, True])
 def test_a_lasting_disturbance_acts_in_every_recording_for_about_a_run(name, runs, hidden):
     for index in range(3):

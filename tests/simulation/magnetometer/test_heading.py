@@ -151,6 +151,7 @@ def test_a_quadrotors_heading_reset_at_take_off_is_reported(name):
 
 
 @pytest.mark.e2e
+@pytest.mark.slow
 def test_the_first_finding_of_the_steering_compass_is_the_heading_reset():
     result = diagnose(Magnetometer(), Recording.read(shared_data("magnetometer/quadrotor_compass1.csv")))
     first = result.findings[0]
