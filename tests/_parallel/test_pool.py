@@ -223,7 +223,7 @@ CODE = """
         results = []
         for copies in (0, 1):
             allow_copies(copies)
-            diagnosis = diagnose(simulation, recording, surrogates=19, max_findings=1)
+            diagnosis = diagnose(simulation, recording, max_findings=1)
             results.append(diagnosis_to_json(diagnosis))
         same = alike(*map(json.loads, results))
         print([f.effect for f in diagnosis.findings], same, len(forks) > 3)
