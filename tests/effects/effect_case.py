@@ -28,7 +28,12 @@ def is_nonlinear(effect):
 UNITLESS = ("share", "share_of_load", "gain_error", "gain_at_mean", "gain_change", "rate")
 """Names of quantities without a unit."""
 
-DECLARED_FOLLOWS_SIGNAL = {"constant_change": True, "constant_force": True, "driver_force": True, "heading_reset": False}
+DECLARED_FOLLOWS_SIGNAL = {
+    "constant_change": True,
+    "constant_force": True,
+    "driver_force": True,
+    "heading_reset": False,
+}
 """Exceptions of ``follows_signal``: all effects on a rate have it; the signal of a heading has no noise."""
 
 
