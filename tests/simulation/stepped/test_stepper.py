@@ -43,7 +43,7 @@ def test_the_trajectory_is_that_of_single_steps(inertia, weight, angle, friction
     found = prepared.trajectory(theta, changes)
     assert found.converged
     expected = stepped_by_hand(theta.tolist(), recording["torque"].tolist(), friction)
-    np.testing.assert_allclose(found.states[prepared.rows].numpy(), expected, atol=1e-10)
+    np.testing.assert_allclose(found.states[prepared.rows].numpy(), expected, atol=1e-9)  # Newton stops there
 
 
 def test_derivatives_are_those_of_the_whole_rollout():
