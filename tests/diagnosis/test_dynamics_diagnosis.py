@@ -134,6 +134,7 @@ def tanks_recording(leak, seed=0):
 
 
 @pytest.mark.e2e
+@pytest.mark.slow
 def test_a_pipe_between_two_tanks_is_named_and_sized():
     finding = only_confirmed_finding(diagnose(Tanks(), tanks_recording(0.15), **QUICK), "coupling")
     exchange, error = value(finding, "exchange")

@@ -168,6 +168,7 @@ def test_the_corrected_class_has_the_sizes_of_the_selected_recording(diagnosed):
 
 
 @pytest.mark.e2e
+@pytest.mark.slow
 def test_equal_drag_has_a_common_size():
     diagnosis = diagnose(Vehicle(), vehicles((0.010, 0.010), 2), input_hold={"force": "held"}, surrogates=19)
     (finding,) = diagnosis.findings
@@ -180,6 +181,7 @@ def test_equal_drag_has_a_common_size():
 
 
 @pytest.mark.e2e
+@pytest.mark.slow
 def test_a_difference_from_a_common_parameter_of_the_simulation_is_named():
     recordings = vehicles((0.0067, 0.020), 1)
     diagnosis = diagnose(DraggedVehicle(), recordings, input_hold={"force": "held"}, surrogates=19)

@@ -42,6 +42,7 @@ def recorded(count=400):
 
 
 @pytest.mark.e2e
+@pytest.mark.slow
 def test_the_hold_is_chosen_again_with_the_effect():
     found = diagnose(Tanks(), recorded(), effects=(DeadZone(),), surrogates=19, max_findings=1)
     assert found.environment.input_hold == {"valve": "held"}

@@ -45,6 +45,7 @@ def recording(samples=800, step=3.0, fine=20):
 
 
 @pytest.mark.e2e
+@pytest.mark.slow
 def test_radiation_and_a_lag_of_the_sensor_are_found():
     effects = [effect for effect in DYNAMICS if effect.id in NAMES]
     found = diagnose(Heater(), recording(), effects=effects, surrogates=19)
