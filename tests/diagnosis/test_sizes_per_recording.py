@@ -168,7 +168,6 @@ def test_the_corrected_class_has_the_sizes_of_the_selected_recording(diagnosed):
 
 
 @pytest.mark.e2e
-@pytest.mark.slow
 def test_equal_drag_has_a_common_size():
     diagnosis = diagnose(Vehicle(), vehicles((0.010, 0.010), 2), input_hold={"force": "held"}, surrogates=19)
     (finding,) = diagnosis.findings
