@@ -68,7 +68,8 @@ def _by_price(models: Sequence[Candidate], terms: Sequence[Term]) -> list[Candid
 
     The same dependence on a column can have two names, as a loss and as the parameter of this loss; and a buoyancy
     whose surface is above the whole motion is a constant force. Of models of equal price and score with the same
-    columns, that with the fewest shapes comes first, and then the name that is first in the catalogue.
+    columns, that with the fewest shapes comes first, and then, if a column drives it, the name that is first in the
+    catalogue.
     """
 
     def price(model: Candidate) -> tuple[float, int]:
@@ -78,7 +79,7 @@ def _by_price(models: Sequence[Candidate], terms: Sequence[Term]) -> list[Candid
         return sorted(term.columns for term in model.fit.model.terms)
 
     def place(model: Candidate) -> tuple[int, list[int]]:
-        own = {term.key for term in model.fit.model.terms}
+        own = {term.key for term in model.fit.model.terms} if any(columns(model)) else set()
         shapes = sum(len(term.shape) for term in model.fit.model.terms)
         return shapes, sorted(number for number, term in enumerate(terms) if term.key in own)
 
