@@ -159,4 +159,4 @@ def _stacked(slopes: Sequence[Array], base: Array) -> Array:
 def _difference(values: Array) -> float:
     """A step for a whole column by its mean absolute value, because a value near 0 has no scale."""
     size = float(np.abs(values).mean()) if len(values) else 1.0
-    return _STEP * (size if 0.0 < size < np.inf else 1.0)
+    return _STEP * (size if np.finfo(size).tiny < _STEP * size < np.inf else 1.0)

@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mkc_torch.recording import Recording
@@ -35,6 +35,7 @@ def stepped_by_hand(theta, inputs, friction, parts=2):
 
 @settings(deadline=None, max_examples=10)
 @given(st.floats(0.3, 0.9), st.floats(2.0, 6.0), st.floats(-1.0, 1.0), st.floats(0.0, 0.3))
+@example(0.5, 2.0, 0.0, 5e-324)  # a force whose differences round to 0
 def test_the_trajectory_is_that_of_single_steps(inertia, weight, angle, friction):
     recording = recording_of()
     prepared = Steps().prepare(recording)
