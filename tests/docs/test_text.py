@@ -54,8 +54,10 @@ def test_the_second_block_of_the_readme_runs_the_tests():
     found = subprocess.run(["awk", program, README], capture_output=True, text=True, check=True).stdout
     assert found.strip() == [block.text for block in blocks(README) if block.language == "sh"][1]
     assert found.strip().endswith(".venv/bin/python -m pytest -q -n auto")
-    assert "bash -euo pipefail -c \"$test_command -m 'not slow' --dist loadscope --hypothesis-profile=ci --durations=20\"\n" in script
-    assert "python -m pytest -q -n auto --hypothesis-profile=ci --doctest-modules mkc_torch examples/blind_proof\n" in script
+    options = "-m 'not slow' --dist loadscope --hypothesis-profile=ci --durations=20"
+    assert f'bash -euo pipefail -c "$test_command {options}"\n' in script
+    doctests = "--hypothesis-profile=ci --doctest-modules mkc_torch examples/blind_proof"
+    assert f"python -m pytest -q -n auto {doctests}\n" in script
 
 
 def test_the_readme_links_to_every_page():
