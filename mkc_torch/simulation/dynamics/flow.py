@@ -48,7 +48,8 @@ def plausible_sizes(
     courses = (own, torch.cat([guess, own[:, n:]], -1))
     shown, span = torch.zeros_like(own[0, :n]), own[:, :n].amax(0) - own[:, :n].amin(0)
     for course in courses:
-        rates = free.rate(theta, changes)(prepared.grid.spread(course))[::3, :n].detach().abs().nan_to_num(0.0, 0.0)
+        rates = free.rate(theta, changes)(prepared.grid.spread(course))[:: prepared.grid.per_interval, :n]
+        rates = rates.detach().abs().nan_to_num(0.0, 0.0)
         shown = torch.maximum(shown, torch.quantile(rates, _RATE_QUANTILE, 0))
     lasted = (prepared.time[-1] - prepared.time[0]).clamp(min=torch.finfo(span.dtype).tiny)
     places = [system.states.index(name) for name in prepared.disturbable]

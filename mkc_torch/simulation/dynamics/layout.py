@@ -119,7 +119,7 @@ def lay_out(known: InputRows, parts: int, map_step: float | None = None) -> Layo
     clock = clocks(at, share)[1]
     nodes = torch.cat([clock.before[::3], clock.before[-1:]]), torch.cat([clock.share[::3], clock.share[-1:]])
     if map_step is not None:
-        at, share = at[::3].repeat_interleave(3), share[::3].repeat_interleave(3)
+        at, share, early = at[::3], share[::3], before
     grid, found = Grid(time, begins, map_step), clocks(at, share)
     return Layout(grid, first[known.samples], *found, *nodes)
 

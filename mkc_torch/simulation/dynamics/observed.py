@@ -15,6 +15,7 @@ from mkc_torch.simulation.dynamics.missing import MissingOutputs
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observer, ObserverJump
 from mkc_torch.simulation.dynamics.single_outputs import with_changes
 from mkc_torch.simulation.dynamics.steps import port_of
+from mkc_torch.simulation.dynamics.trajectory import Grid
 from mkc_torch.simulation.dynamics.user_functions import namespace
 from mkc_torch.simulation.dynamics.varying import Acting, varied
 from mkc_torch.simulation.names import Names
@@ -41,6 +42,7 @@ class ObservedDynamics:
     system: Equations
     channels: tuple[str, ...]
     observer: Observer | None = None
+    grid: Grid
     time: Tensor
     run: Tensor
     rows: Tensor
@@ -100,7 +102,7 @@ class ObservedDynamics:
     @property
     def _stations_of_samples(self) -> Tensor:
         """The station at each sample: the last one at the end, elsewhere the first of the interval that begins."""
-        return (3 * self.rows).clamp(max=len(self.clock.time) - 1)
+        return (self.grid.per_interval * self.rows).clamp(max=len(self.clock.time) - 1)
 
     def acting_inputs(self, theta: Tensor, changes: Changes) -> Float[Tensor, "S u"]:
         """The inputs at the stations, with effects and the actuator."""

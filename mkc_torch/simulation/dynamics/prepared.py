@@ -392,11 +392,9 @@ class PreparedDynamics(CheckedDynamics):
 
     def _rates(self, acting: Acting, states: Tensor) -> list[Tensor]:
         """Rates of the states by the simulation's own equations."""
-        every = 1 if self.grid.map_step is None else 3
-        u = namespace(self.system.inputs, acting.inputs[::every])
-        rates = self._derivative(self.clock.time[::every], states[::every], u, acting.parameters)
-        # the stations of a step are the same, and only the first has derivatives
-        return rates if every == 1 else [torch.stack([r, r.detach(), r.detach()], -1).flatten() for r in rates]
+        return self._derivative(
+            self.clock.time, states, namespace(self.system.inputs, acting.inputs), acting.parameters
+        )
 
     def _signal(self, port: Port, acting: Acting, states: Tensor, rates: Sequence[Tensor]) -> Float[Tensor, "S k"]:
         """Signal at a rate port: the states and inputs, then the rate or the load where the port has it."""
@@ -427,7 +425,7 @@ class PreparedDynamics(CheckedDynamics):
     def _check_functions(self) -> None:
         theta = self.time.new_tensor([parameter.value for parameter in self.known.values()])
         at = self.grid.spread(self.guess)
-        first = at[::3][:1].expand(len(self.time), -1)
+        first = at[:1].expand(len(self.time), -1)
         stations = SampledStates(self.clock.time, at, self.inputs, self.run[self.clock.before])
         samples = SampledStates(self.time, first, self.inputs_at_rows, self.run)
         check_functions(self.system, self.parameters_of(theta), stations, samples, self.channels)

@@ -61,19 +61,26 @@ def rolled_out(
         changes: the changes by effects, by port.
         begin: (K, w), the initial states of the trajectories, with internal states of effects.
     """
+    guess = plain_steps(prepared, theta, changes, begin)
+    if guess is None:
+        return Trajectory(begin.new_zeros(len(prepared.grid.time), begin.shape[1]), False)
+    return solve(rate, prepared.grid, begin, guess)
+
+
+def plain_steps(
+    prepared: Stepping, theta: Float[Tensor, " p"], changes: Changes, begin: Float[Tensor, "K w"]
+) -> Float[Tensor, "G w"] | None:
+    """Return the states by plain steps, as in :func:`rolled_out`; None where the simulation or a state fails."""
     system, now = prepared.system, prepared.acting(theta, changes)
-    count = len(prepared.grid.time)
     if system.steps is None or begin.shape[1] > len(system.states):  # internal states of effects have no step
-        return Trajectory(begin.new_zeros(count, begin.shape[1]), False)
+        return None
     names = enumerate(system.inputs)
     entering = {k: changes[f"entry of {name}"] for k, name in names if f"entry of {name}" in changes}
     rollout = system.steps.rollout
-    guess = stepped(
+    found = stepped(
         lambda state, inputs: rollout(state, inputs, now.parameters), prepared.grid, begin, now.inputs, entering
     )
-    if not bool(guess.isfinite().all()):
-        return Trajectory(guess.nan_to_num(), False)
-    return solve(rate, prepared.grid, begin, guess)
+    return found if bool(found.isfinite().all()) else None
 
 
 def stepped(
@@ -101,7 +108,7 @@ def stepped(
     found = begin.new_empty(len(grid.time), begin.shape[1])
     for start, end, state in zip(first, ends, begin, strict=True):
         found[start] = state
-        driven = inputs[3 * start : 3 * (end - 1) : 3]
+        driven = inputs[start : end - 1]
         if not entering:
             found[start + 1 : end] = after(state.unsqueeze(0), driven)
             continue
@@ -110,6 +117,6 @@ def stepped(
             signal = torch.cat([found[[k]], now], -1).expand(len(inputs), -1)
             added = now.clone()
             for place, change in entering.items():
-                added[0, place] += change(signal)[3 * k, 0]
+                added[0, place] += change(signal)[k, 0]
             found[k + 1] = after(found[[k]], added)[0]
     return found

@@ -48,14 +48,13 @@ class Grid:
     """Grid times of one or several trajectories, in sequence.
 
     The rates are evaluated at three stations of each interval: its left end, middle and right end. The interval before
-    the start of a trajectory has length 0.
+    the start of a trajectory has length 0. A simulation that steps has a station at the left end only.
 
     Attributes:
         time: (G,), in s.
         begins: (G,), True where a trajectory starts, and for the first time.
         map_step: for a simulation that steps, the length of its step in s, whatever the times of the grid: the states
-            follow the map ``x + map_step rate(x)``, and all stations of an interval are at its left end. None for a
-            differential equation.
+            follow the map ``x + map_step rate(x)``. None for a differential equation.
     """
 
     time: Float[Tensor, " G"]
@@ -69,15 +68,20 @@ class Grid:
         return torch.where(self.begins[1:], 0.0, inside)
 
     @property
-    def stations(self) -> Float[Tensor, " 3G-3"]:
+    def per_interval(self) -> int:
+        """Number of stations of an interval."""
+        return 3 if self.map_step is None else 1
+
+    @property
+    def stations(self) -> Float[Tensor, " S"]:
         """Times of the stations in s."""
         return self.spread(self.time)
 
-    def spread(self, values: Float[Tensor, G * rest]) -> Float[Tensor, "3G-3 *rest"]:
+    def spread(self, values: Float[Tensor, G * rest]) -> Float[Tensor, S * rest]:
         """Interpolate values at the grid times to the stations linearly."""
         left, right = values[:-1], values[1:]
         if self.map_step is not None:
-            return left.repeat_interleave(3, 0)
+            return left
         return torch.stack([left, 0.5 * (left + right), right], 1).flatten(0, 1)
 
     @property
@@ -322,11 +326,11 @@ def _joined(left: Tensor, middle: Tensor, right: Tensor) -> Tensor:
     return torch.stack([left, middle, right], 1).flatten(0, 1)
 
 
-def stations(rate: Rate, states: Float[Tensor, "G n"], grid: Grid, jump: Jump | None = None) -> Float[Tensor, "3G-3 n"]:
+def stations(rate: Rate, states: Float[Tensor, "G n"], grid: Grid, jump: Jump | None = None) -> Float[Tensor, "S n"]:
     """States at the stations; the midpoint is on the cubic Hermite polynomial through the interval's ends."""
     left, right = _after(states, jump)[:-1], states[1:]
     if grid.map_step is not None:
-        return left.repeat_interleave(3, 0)
+        return left
     middle = 0.5 * (left + right)
     at_left, _, at_right = _ends(rate(_joined(left, middle, right)))
     return _joined(left, middle + 0.125 * grid.step.unsqueeze(-1) * (at_left - at_right), right)
@@ -336,9 +340,11 @@ def defect(rate: Rate, states: Float[Tensor, "G n"], grid: Grid, jump: Jump | No
     """Defect of Simpson's rule, or of the map, over each interval, (G-1, n); 0 before the start of a trajectory."""
     step = grid.step.unsqueeze(-1)
     at = stations(rate, states, grid, jump)
+    gone = torch.where(step > 0, states[1:] - at[:: grid.per_interval], 0.0)
+    if grid.map_step is not None:
+        return gone - step * rate(at)
     left, middle, right = _ends(rate(at))
-    gone = torch.where(step > 0, states[1:] - at[::3], 0.0)
-    return gone - step * (left if grid.map_step is not None else (left + 4.0 * middle + right) / 6.0)
+    return gone - step * (left + 4.0 * middle + right) / 6.0
 
 
 def _after(states: Float[Tensor, "G n"], jump: Jump | None) -> Float[Tensor, "G n"]:
@@ -352,10 +358,10 @@ def transition_matrices(
     n = states.shape[1]
     eye = torch.eye(n, dtype=states.dtype, device=states.device)
     slope = slopes(rate, stations(rate, states, grid, jump).detach(), at_once=grid.map_step is not None)
-    left, middle, right = _ends(slope)
     h = grid.step.unsqueeze(-1).unsqueeze(-1)
     if grid.map_step is not None:
-        return torch.where(h > 0, eye + h * left, 0.0), eye.expand_as(left)
+        return torch.where(h > 0, eye + h * slope, 0.0), eye.expand_as(slope)
+    left, middle, right = _ends(slope)
     behind = -eye - h / 6.0 * (left + 4.0 * middle @ (0.5 * eye + 0.125 * h * left))
     ahead = eye - h / 6.0 * (right + 4.0 * middle @ (0.5 * eye - 0.125 * h * right))
     inverse, _ = torch.linalg.inv_ex(ahead)

@@ -61,25 +61,31 @@ class Evaluation(CachedEvaluation):
         return self.binary.values(outputs, *rows)
 
     def columns(
-        self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, base: Array
+        self,
+        outputs: bool,
+        rows: tuple[Array, Array, Array],
+        given: Array,
+        group: Group,
+        numbers: Sequence[int],
+        base: Array,
     ) -> Array:
-        description = self.description
-        quantities = list(getattr(description, group))
-        trusted = [self._is_trusted(outputs, rows, given, group, k) for k in range(len(quantities))]
-        found = np.empty((len(rows[0]), self.count(outputs), len(quantities)))
-        by = [k for k, usable in enumerate(trusted) if usable]
+        quantities = list(getattr(self.description, group))
+        trusted = [self._is_trusted(outputs, rows, given, group, k) for k in numbers]
+        found = np.empty((len(rows[0]), self.count(outputs), len(numbers)))
+        by = [place for place, usable in enumerate(trusted) if usable]
         if by and self.binary.begin(given.tolist()):
-            references = [quantities[k].reference for k in by]
+            references = [quantities[numbers[place]].reference for place in by]
             found[:, :, by] = self.binary.slopes(outputs, *rows, references).swapaxes(1, 2)
         elif by:
             found[:, :, by] = np.nan
-        for k in range(len(quantities)):
-            if trusted[k]:
+        for place, k in enumerate(numbers):
+            if trusted[place]:
                 continue
             if group == "parameters" and self._is_affine(outputs, rows, given, k):
-                found[:, :, k] = self._one_sided_difference(outputs, rows, given, k, base, self._step_within(given, k))
+                step = self._step_within(given, k)
+                found[:, :, place] = self._one_sided_difference(outputs, rows, given, k, base, step)
             else:
-                found[:, :, k] = self._central_difference(outputs, rows, given, group, k)
+                found[:, :, place] = self._central_difference(outputs, rows, given, group, k)
         return found
 
     def _is_affine(self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, place: int) -> bool:
@@ -165,4 +171,4 @@ def _rows(parts: tuple[Array, Array, Array], which: Any) -> tuple[Array, Array, 
 def _step(values: Sequence[float] | Array) -> float:
     """A step for a whole column by its mean absolute value, because a value near 0 has no scale."""
     size = float(np.abs(values).mean()) if len(values) else 1.0
-    return _STEP * (size if 0.0 < size < np.inf else 1.0)
+    return _STEP * (size if np.finfo(size).tiny < _STEP * size < np.inf else 1.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -28,6 +28,8 @@ class EvaluationPoints:
         self.parts = tuple(np.ascontiguousarray(part, np.float64) for part in (time, states, inputs, parameters))
 
     def __eq__(self, other: object) -> bool:
+        if self is other:
+            return True
         return isinstance(other, EvaluationPoints) and all(map(np.array_equal, self.parts, other.parts))
 
     __hash__ = None  # type: ignore[assignment]
@@ -88,9 +90,15 @@ class CachedEvaluation(ABC):
 
     @abstractmethod
     def columns(
-        self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, base: Array
+        self,
+        outputs: bool,
+        rows: tuple[Array, Array, Array],
+        given: Array,
+        group: Group,
+        numbers: Sequence[int],
+        base: Array,
     ) -> Array:
-        """Derivatives by each variable of a group, (S, k, size of the group); ``base`` are the values there."""
+        """Derivatives by some variables of a group, (S, k, numbers); ``base`` are the values there."""
 
     def values(self, outputs: bool, at: EvaluationPoints) -> Array:
         """The rates of the states, or the outputs, (S, k); NaN where the simulation fails."""
@@ -113,12 +121,13 @@ class CachedEvaluation(ABC):
     def slopes(self, outputs: bool, at: EvaluationPoints, group: Group) -> Array:
         """Derivatives of rates or outputs by each variable of a group, (S, k, size of the group)."""
 
-        def computed() -> Array:
-            new = at.new()
-            base = self.values(outputs, at)[new]
-            return self.columns(outputs, at.rows(new), at.parts[3], group, base)[new.cumsum() - 1]
+        numbers = range({"states": at.parts[1], "inputs": at.parts[2], "parameters": at.parts[3]}[group].shape[-1])
+        return self._cached(("slopes", outputs, group), at, lambda: self._slopes_by(outputs, at, group, numbers))
 
-        return self._cached(("slopes", outputs, group), at, computed)
+    def _slopes_by(self, outputs: bool, at: EvaluationPoints, group: Group, numbers: Sequence[int]) -> Array:
+        new = at.new()
+        base = self.values(outputs, at)[new]
+        return self.columns(outputs, at.rows(new), at.parts[3], group, numbers, base)[new.cumsum() - 1]
 
     def _cached(self, what: Any, at: EvaluationPoints, compute: Callable[[], Array]) -> Array:
         for known, moments, answer in self._known:

@@ -60,7 +60,8 @@ class StepperEvaluation(CachedEvaluation):
     ) -> None:
         super().__init__()
         self.stepper, self.shown, self.constants = stepper, shown, dict(constants)
-        self._slopes: dict[tuple[bool, Group], tuple[EvaluationPoints, Array]] = {}
+        self._slopes: dict[tuple[bool, Group, int], tuple[EvaluationPoints, Array]] = {}
+        self._compared: tuple[EvaluationPoints, EvaluationPoints, bool] | None = None
         self.states, self.inputs, self.parameters = states, inputs, parameters
 
     def __getstate__(self) -> tuple[object, ...]:
@@ -104,26 +105,45 @@ class StepperEvaluation(CachedEvaluation):
         return found
 
     def slopes(self, outputs: bool, at: EvaluationPoints, group: Group) -> Array:
-        """Derivatives by each variable of a group, (S, k, size of the group); those of points nearby where known.
+        """Derivatives by each variable of a group, (S, k, size of the group); as in :meth:`slope`."""
+        size = {"states": at.parts[1], "inputs": at.parts[2], "parameters": at.parts[3]}[group].shape[-1]
+        slopes = [self.slope(outputs, at, group, number) for number in range(size)]
+        return np.stack(slopes, -1) if slopes else np.empty((len(at.parts[0]), self.count(outputs), 0))
+
+    def slope(self, outputs: bool, at: EvaluationPoints, group: Group, number: int) -> Array:
+        """Derivatives by a variable of a group, (S, k); those of points nearby where known.
 
         They are differences of many steps, and change no value: only how fast a solution converges.
         """
-        known = self._slopes.get((outputs, group))
-        if known is None or not at.near(known[0], _NEAR):
-            known = self._slopes[outputs, group] = at, super().slopes(outputs, at, group)
+        known = self._slopes.get((outputs, group, number))
+        if known is None or not self._near(at, known[0]):
+            found = self._slopes_by(outputs, at, group, [number])[..., 0]
+            known = self._slopes[outputs, group, number] = at, found
         return known[1]
 
+    def _near(self, at: EvaluationPoints, known: EvaluationPoints) -> bool:
+        """Whether derivatives at points are those at others; the derivatives by many variables ask in turn."""
+        if self._compared is None or self._compared[0] is not at or self._compared[1] is not known:
+            self._compared = at, known, at.near(known, _NEAR)
+        return self._compared[2]
+
     def columns(
-        self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, base: Array
+        self,
+        outputs: bool,
+        rows: tuple[Array, Array, Array],
+        given: Array,
+        group: Group,
+        numbers: Sequence[int],
+        base: Array,
     ) -> Array:
         time, states, inputs = rows
         if group == "parameters":
-            moved = [_moved(given, k, _STEP * (abs(value) or 1.0)) for k, value in enumerate(given)]
-            changes = [self.fresh(outputs, rows, values) - base for values in moved]
-            return _stacked([changes[k] / (moved[k][k] - given[k]) for k in range(len(given))], base)
+            moved = {k: _moved(given, k, _STEP * (abs(given[k]) or 1.0)) for k in numbers}
+            changes = {k: self.fresh(outputs, rows, values) - base for k, values in moved.items()}
+            return _stacked([change / (moved[k][k] - given[k]) for k, change in changes.items()], base)
         table = states if group == "states" else inputs
         slopes = []
-        for k in range(table.shape[1]):
+        for k in numbers:
             moved_table = _moved(table.T, k, _difference(table[:, k])).T
             pair = (moved_table, inputs) if group == "states" else (states, moved_table)
             with np.errstate(invalid="ignore"):  # where the simulation fails

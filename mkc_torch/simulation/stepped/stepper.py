@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.dynamics.compiled.foreign import traced_call
 from mkc_torch.simulation.dynamics.definition import Dynamics
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.dynamics.steps import Steps
@@ -192,15 +193,18 @@ class Stepper(Dynamics):
         return torch.from_numpy(self.rollout(x, given[:, :m], given[:, forces], named, self.time_step)).to(state)
 
     def _evaluated(self, outputs: bool, time: Tensor, x: Any, u: Any, p: Any) -> Tensor:
-        evaluation = self._evaluation
-        states = torch.stack(torch.broadcast_tensors(*(getattr(x, name) for name in evaluation.states)), -1)
-        rows = states.shape[0]
-        given = vars(u)
+        evaluation, given = self._evaluation, vars(u)
+        own = torch.broadcast_tensors(*(getattr(x, name) for name in evaluation.states))
+        rows = len(own[0])
         columns = [given[name].expand(rows) for name in evaluation.inputs]
         # forces and changes of constants are 0 for a caller that has none
-        columns += [given[name].expand(rows) if name in given else states.new_zeros(rows) for name in self._added]
-        inputs = torch.stack(columns, -1) if columns else states.new_zeros(rows, 0)
+        columns += [given[name].expand(rows) if name in given else own[0].new_zeros(rows) for name in self._added]
         known = [getattr(p, name) for name in evaluation.parameters]
+        traced = traced_call(evaluation, outputs, time.expand(rows), own, columns, known)
+        if traced is not None:
+            return traced
+        states = torch.stack(own, -1)
+        inputs = torch.stack(columns, -1) if columns else states.new_zeros(rows, 0)
         parameters = torch.stack(known) if known else states.new_zeros(0)
         return evaluated(evaluation, outputs, time.expand(rows), states, inputs, parameters)
 

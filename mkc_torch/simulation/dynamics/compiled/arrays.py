@@ -85,10 +85,14 @@ class ArrayCollocation:
         parameters = [*rated, *seen]
         defects = np.zeros((len(states), len(parameters), len(h)))
         by_ends = ends.by_parameters.at(values)(linear.ends)
-        left, right = by_ends[:, :, 0], by_ends[:, :, 1]
-        moved = multiplied(linear.middle_slope, 0.125 * h * (left - right))
-        by_middle = middle.by_parameters.at(values)(linear.middle)
-        defects[:, : len(rated)] = -h / 6.0 * (left + 4.0 * (by_middle + moved) + right)
+        left = by_ends[:, :, 0]
+        if self._system.grid.maps:
+            defects[:, : len(rated)] = -h * left
+        else:
+            right = by_ends[:, :, 1]
+            moved = multiplied(linear.middle_slope, 0.125 * h * (left - right))
+            by_middle = middle.by_parameters.at(values)(linear.middle)
+            defects[:, : len(rated)] = -h / 6.0 * (left + 4.0 * (by_middle + moved) + right)
         if new is not None and new.moving:
             assert isinstance(self._functions.jump, CompiledObserverJump)
             by_new = self._system.innovations_by_parameters(values, states)
@@ -96,5 +100,5 @@ class ArrayCollocation:
             places = [parameters.index(k) for k in new.moving]
             defects[:, places] += np.where(h > 0, multiplied(linear.behind, after), 0.0)
         source = np.zeros((len(states), len(parameters), states.shape[1]))
-        source[..., 1:] = -multiplied(linear.factor.inverse, defects)
+        source[..., 1:] = linear.factor.cancelled(defects)
         return ParameterSources(parameters, source, linear.factor)

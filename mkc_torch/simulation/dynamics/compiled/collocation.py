@@ -17,6 +17,7 @@ from mkc_torch.simulation.dynamics.settings import (
     HORIZON,
     MOST_STEPS,
     QUICK,
+    QUICK_MAP,
     ROUGHLY,
     ROUNDING,
     SETTLED,
@@ -40,6 +41,8 @@ class JumpFunctions(Protocol):
 class Functions:
     """A differential equation at given parameters, for states at the ends (w, 2, G-1) and in the middle (w, G-1).
 
+    A map, of a simulation that steps, is for states at the left ends (w, 1, G-1), with none in the middle.
+
     Attributes:
         ends, middle: the rates, in the states' shape.
         ends_slope, middle_slope: derivatives of the rates by the states, (w, w, 2, G-1) and (w, w, G-1).
@@ -61,11 +64,18 @@ class ArrayGrid:
         step: (G-1,), length of each interval in s; 0 before the start of a trajectory.
         begins: (G,), True where a trajectory starts.
         longest: number of grid times of the longest trajectory.
+        maps: whether the states follow the map ``x + step rate(x)`` instead of a differential equation.
     """
 
     step: Array
     begins: np.ndarray[tuple[int], np.dtype[np.bool_]]
     longest: int
+    maps: bool = False
+
+    @property
+    def quick(self) -> float:
+        """Share of the defect that a step with old linearised equations may leave."""
+        return QUICK_MAP if self.maps else QUICK
 
 
 @dataclass(frozen=True)
@@ -74,16 +84,19 @@ class Factor:
 
     Attributes:
         affine: the recurrence of a small change of the states.
-        inverse: derivative of an interval's end by its negative defect, (w, w, G-1).
+        inverse: derivative of an interval's end by its negative defect, (w, w, G-1); None where it is 1.
     """
 
     affine: Affine
-    inverse: Array
+    inverse: Array | None
 
     def solved(self, defect: Array) -> Array:
         """Solve for the change of the states, (w, K, G), that cancels defects (w, K, G-1) at fixed initial states."""
-        source = multiplied(self.inverse, defect)
-        return self.affine.solved(np.concatenate([np.zeros_like(source[..., :1]), -source], -1))
+        return self.affine.solved(np.concatenate([np.zeros_like(defect[..., :1]), self.cancelled(defect)], -1))
+
+    def cancelled(self, defect: Array) -> Array:
+        """The change of each interval's end that cancels its defect, (w, K, G-1), at a fixed start."""
+        return -defect if self.inverse is None else -multiplied(self.inverse, defect)
 
 
 @dataclass(frozen=True)
@@ -160,6 +173,10 @@ class _Iterate:
 def _defect(functions: Functions, grid: ArrayGrid, states: Array) -> tuple[Array, Array, Array]:
     """States at the ends and in the middle of each interval, and the defect of Simpson's rule."""
     h, after = grid.step, states if functions.jump is None else functions.jump.applied(states)
+    if grid.maps:
+        left = after[:, None, :-1]
+        gone = np.where(h > 0, states[:, 1:] - after[:, :-1], 0.0)
+        return left, left[:, 0], gone - h * functions.ends(left)[:, 0]
     ends = np.stack([after[:, :-1], states[:, 1:]], 1)
     rates = functions.ends(ends)
     middle = 0.5 * (ends[:, 0] + ends[:, 1]) + 0.125 * h * (rates[:, 0] - rates[:, 1])
@@ -175,12 +192,17 @@ def linearised(functions: Functions, grid: ArrayGrid, states: Array) -> Linearis
 
 def _linearised(functions: Functions, grid: ArrayGrid, at: _Iterate) -> LinearisedCollocation:
     h, eye = grid.step, np.eye(len(at.states))[..., None]
-    slope, middle = functions.ends_slope(at.ends), functions.middle_slope(at.middle)
-    left, right = slope[:, :, 0], slope[:, :, 1]
-    behind = -eye - h / 6.0 * (left + 4.0 * multiplied(middle, 0.5 * eye + 0.125 * h * left))
-    ahead = eye - h / 6.0 * (right + 4.0 * multiplied(middle, 0.5 * eye - 0.125 * h * right))
-    inverse = inverted(ahead)
-    carries = np.where(h > 0, -multiplied(inverse, behind), 0.0)
+    slope = functions.ends_slope(at.ends)
+    left = slope[:, :, 0]
+    if grid.maps:
+        middle, inverse, behind = left, None, -eye - h * left
+        carries = np.where(h > 0, -behind, 0.0)
+    else:
+        middle, right = functions.middle_slope(at.middle), slope[:, :, 1]
+        behind = -eye - h / 6.0 * (left + 4.0 * multiplied(middle, 0.5 * eye + 0.125 * h * left))
+        ahead = eye - h / 6.0 * (right + 4.0 * multiplied(middle, 0.5 * eye - 0.125 * h * right))
+        inverse = inverted(ahead)
+        carries = np.where(h > 0, -multiplied(inverse, behind), 0.0)
     if functions.jump is not None:
         carries = multiplied(carries, functions.jump.slope(at.states)[..., :-1])
     carries = np.concatenate([np.zeros_like(carries[..., :1]), carries], -1)
@@ -212,7 +234,7 @@ def solved(
                 if after.norm <= at.norm:
                     break
                 part *= 0.5
-        if not fresh and not after.norm <= QUICK * at.norm:
+        if not fresh and not after.norm <= grid.quick * at.norm:
             factor, fresh = _linearised(functions, grid, at).factor, True
             continue
         if after is at or (not after.norm < at.norm and size * part > ROUNDING):

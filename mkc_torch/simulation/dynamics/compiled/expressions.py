@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -97,11 +98,22 @@ class Course(NamedTuple):
         return self.columns.column(parameters, self.number, self.by)
 
 
+class Call(Protocol):
+    """A function of many values at once; see :class:`..foreign.ForeignCall`."""
+
+    @property
+    def count(self) -> int: ...
+    def points(self, *values: Any) -> Any: ...
+    def values(self, points: Any) -> Array: ...
+    def slope_by(self, argument: int) -> Callable[[Any], Array]: ...
+
+
 @dataclass(frozen=True)
 class Node:
     """An operation on other nodes, or a leaf with its ``value``.
 
-    Leaves are "number", "column", "course", "parameter" and "state".
+    Leaves are "number", "column", "course", "parameter" and "state". A call is a node "points" of its arguments, a
+    node "values" of the points, or "slope" by an argument, and an "item" of these for each value.
     """
 
     operation: str
@@ -126,6 +138,7 @@ class Expressions:
         self.nodes: list[Node] = []
         self.columns: list[Array] = []
         self.courses: list[Course] = []
+        self.calls: list[Call] = []
         self.levels: list[int] = []
         self._leaves: list[frozenset[int]] = []
         self._known: dict[Node, int] = {}
@@ -146,6 +159,27 @@ class Expressions:
         node = self._node(Node("course", (), len(self.courses) - 1))
         self._leaves[node] = frozenset(parameters)
         return node
+
+    def call(self, call: Call, arguments: Sequence[int]) -> list[int]:
+        """The values of a call, an item each."""
+        if call not in self.calls:
+            self.calls.append(call)
+        points = self._node(Node("points", tuple(arguments), self.calls.index(call)))
+        values = self._node(Node("values", (points,)))
+        return [self._node(Node("item", (values,), k)) for k in range(call.count)]
+
+    def function(self, node: int) -> Callable[..., Any]:
+        """The NumPy function of a node that is no leaf."""
+        own = self.nodes[node]
+        if own.operation == "item":
+            return itemgetter(int(own.value))
+        if own.operation not in ("points", "values", "slope"):
+            return FUNCTIONS[own.operation]
+        points = own if own.operation == "points" else self.nodes[own.arguments[0]]
+        call = self.calls[int(points.value)]
+        if own.operation == "points":
+            return call.points
+        return call.values if own.operation == "values" else call.slope_by(int(own.value))
 
     def leaf(self, kind: str, index: int) -> int:
         """The parameter or state of this index; ``kind`` is "parameter" or "state"."""
@@ -190,6 +224,8 @@ class Expressions:
             return self.course(course._replace(by=int(self.nodes[leaf].value)), ())
         if operation in _FLAT:
             return self.number(0.0)
+        if operation == "item":
+            return self._derived_item(node, leaf)
         if operation == "where":
             slopes = [self.derivative(branch, leaf) for branch in arguments[1:]]
             return slopes[0] if slopes[0] == slopes[1] else self.apply("where", arguments[0], *slopes)
@@ -198,6 +234,19 @@ class Expressions:
             slope = self.derivative(argument, leaf)
             if self._value(slope) != 0.0:
                 total = self.apply("add", total, self.apply("mul", _RULES[operation][place](self, node), slope))
+        return total
+
+    def _derived_item(self, node: int, leaf: int) -> int:
+        values = self.nodes[self.nodes[node].arguments[0]]
+        if values.operation != "values":
+            raise KeyError("the second derivative of a call")
+        total, points = self.number(0.0), values.arguments[0]
+        for place, argument in enumerate(self.nodes[points].arguments):
+            slope = self.derivative(argument, leaf)
+            if self._value(slope) != 0.0:
+                by_argument = self._node(Node("slope", (points,), place))
+                own = self._node(Node("item", (by_argument,), self.nodes[node].value))
+                total = self.apply("add", total, self.apply("mul", own, slope))
         return total
 
     def _node(self, node: Node) -> int:

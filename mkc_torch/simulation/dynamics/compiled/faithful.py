@@ -48,7 +48,8 @@ def is_faithful(system: Traceable, theta: Float[Tensor, " p"]) -> bool:
         expected, slopes = torch.func.jvp(dual_constants(functions), (theta, at), (along, moved))[:2]
     except RuntimeError:
         return False
-    ends, moves, rates, slope = (_ends(array) for array in (at, moved, expected[0], slopes[0]))
+    per = system.grid.per_interval
+    ends, moves, rates, slope = (_ends(array, per) for array in (at, moved, expected[0], slopes[0]))
     outputs, seen = expected[1].T, slopes[1].T
     known = [(found.ends, ends, moves, rates, slope)]
     if found.outputs is not None:
@@ -56,9 +57,9 @@ def is_faithful(system: Traceable, theta: Float[Tensor, " p"]) -> bool:
     return all(_agrees(block, values, along, *arrays) for block, *arrays in known)
 
 
-def _ends(values: Tensor) -> Tensor:
-    """Rearrange values at the stations (S, k) to the ends of the intervals, (k, 2, G-1)."""
-    return values.unflatten(0, (-1, 3))[:, ::2].permute(2, 1, 0)
+def _ends(values: Tensor, per_interval: int) -> Tensor:
+    """Rearrange values at the stations (S, k) to the ends of the intervals, (k, 2, G-1), or (k, 1, G-1)."""
+    return values.unflatten(0, (-1, per_interval))[:, ::2].permute(2, 1, 0)
 
 
 def _agrees(

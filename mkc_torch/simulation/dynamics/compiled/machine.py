@@ -169,6 +169,7 @@ class MachineCollocation:
 
 def _copies(factor: Factor) -> tuple[Array, Array]:
     """The linearised equations, to be overwritten."""
+    assert factor.inverse is not None
     return factor.affine.carries[0].copy(), factor.inverse.copy()
 
 

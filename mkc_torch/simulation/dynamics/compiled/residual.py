@@ -20,8 +20,9 @@ from mkc_torch.simulation.dynamics.compiled.expressions import Array
 from mkc_torch.simulation.dynamics.compiled.machine import MachineSystem, machine_system
 from mkc_torch.simulation.dynamics.compiled.traced import Traceable, Traced, traced
 from mkc_torch.simulation.dynamics.observer import CLIP
+from mkc_torch.simulation.dynamics.rollout import plain_steps, rolls_out
 from mkc_torch.simulation.dynamics.trajectory import Jump, Rate, Trajectory, linearised_later
-from mkc_torch.simulation.ports import Answer, Nearby
+from mkc_torch.simulation.ports import Answer, Changes, Nearby
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -45,7 +46,7 @@ class CompiledDynamics:
     def __init__(self, system: Traceable, meaning: Meaning, size: int, functions: Traced) -> None:
         self._system, self._meaning, self._size, self._traced = system, meaning, size, functions
         grid = system.grid
-        self._grid = ArrayGrid(grid.step.numpy(), grid.begins.numpy(), grid.longest)
+        self._grid = ArrayGrid(grid.step.numpy(), grid.begins.numpy(), grid.longest, grid.map_step is not None)
         self._rows = system.rows.numpy()
         self._places = self._grid.begins.cumsum() - 1
         missing = system.missing
@@ -59,21 +60,47 @@ class CompiledDynamics:
         If ``near`` is None, the guess is also improved over a growing horizon.
         """
         known = near if isinstance(near, Trajectory) else None
-        values = parameters.tolist()
         with np.errstate(all="ignore"):
-            equations, first = self._collocation(values), self._first(values)
-            found = None if known is None else equations.solved(*self._guess_nearby(known, first))
-            if found is None:
-                guess = self._with_first_states(self._system.guess, first)
-                found = equations.solved(guess)
-                nearer = marched(equations, self._grid, guess) if found is None and known is None else None
-                found = found if nearer is None else equations.solved(nearer)
+            found = self._stepped(parameters)
+            found = self._solved(parameters, known) if found is None else found
             if found is None:
                 return Answer(torch.full_like(self._system.measured, torch.nan))
-            outputs = self._outputs(parameters, found.states[:, self._rows])
+            states, factor = found
+            outputs = self._outputs(parameters, states[:, self._rows])
             residual = self._whitened((self._measured - outputs)[:, None])[:, 0]
-        nearby = self._nearby(parameters, found.states, found.factor)
+        nearby = self._nearby(parameters, states, factor)
         return Answer(torch.from_numpy(np.ascontiguousarray(residual.T)), nearby)
+
+    def _stepped(self, parameters: Tensor) -> tuple[Array, Factor | None] | None:
+        """The states of a simulation that steps by its own steps; None where effects add to them, or they fail."""
+        theta, changes = self._meaning(parameters)
+        found = self._plain_steps(theta, changes) if rolls_out(self._system, theta, changes) else None
+        return None if found is None else (found, None)
+
+    def _solved(self, parameters: Tensor, known: Trajectory | None) -> tuple[Array, Factor | None] | None:
+        """The states from a trajectory nearby or the first guess, and the linearised equations; None without any."""
+        values = parameters.tolist()
+        equations, first = self._collocation(values), self._first(values)
+        found = None if known is None else equations.solved(*self._guess_nearby(known, first))
+        # a fit of a simulation that steps shortens its own step where this fails
+        if found is None and (known is None or not self._grid.maps):
+            guess = self._with_first_states(self._system.guess, first)
+            found = equations.solved(guess)
+            nearer = self._nearer(parameters, equations, guess) if found is None and known is None else None
+            found = found if nearer is None else equations.solved(nearer)
+        return None if found is None else (found.states, found.factor)
+
+    def _nearer(self, parameters: Tensor, equations: Collocation, guess: Array) -> Array | None:
+        """A better guess, by plain steps or over a growing horizon; None where that fails."""
+        if not self._grid.maps:
+            return marched(equations, self._grid, guess)
+        return self._plain_steps(*self._meaning(parameters))
+
+    def _plain_steps(self, theta: Tensor, changes: Changes) -> Array | None:
+        if self._system.observer is not None:
+            return None
+        found = plain_steps(self._system, theta, changes, self._system.first_states(theta, changes)[0])
+        return None if found is None else np.ascontiguousarray(found.numpy().T)
 
     def marched(
         self, parameters: Float[Tensor, " p"], guess: Float[Tensor, "G w"], stride: int
@@ -159,7 +186,7 @@ class CompiledDynamics:
     @cached_property
     def _equations(self) -> MachineSystem | ArraySystem:
         parts = self._traced, self._grid, self._rows, self._observed
-        return machine_system(*parts) or ArraySystem(*parts)
+        return (None if self._grid.maps else machine_system(*parts)) or ArraySystem(*parts)
 
     def _first(self, values: Sequence[float]) -> Array:
         """The initial states, (w, K)."""
@@ -171,7 +198,7 @@ class CompiledDynamics:
         white = rows if self._white is None else multiplied(self._white, rows)
         return white if self._nearest is None else np.take_along_axis(white, self._nearest, 2)
 
-    def _nearby(self, parameters: Tensor, states: Array, factor: Factor) -> Trajectory:
+    def _nearby(self, parameters: Tensor, states: Array, factor: Factor | None) -> Trajectory:
         system, meaning = self._system, self._meaning
         found = torch.from_numpy(np.ascontiguousarray(states.T))
 

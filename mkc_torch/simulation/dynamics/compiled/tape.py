@@ -9,7 +9,6 @@ import numpy as np
 
 from mkc_torch.simulation.dynamics.compiled.expressions import (
     CONSTANT,
-    FUNCTIONS,
     PARAMETER,
     STATE,
     Array,
@@ -61,7 +60,7 @@ class Tape:
                 self._states.append((k, int(own.value)))
             else:
                 arguments = tuple(place[argument] for argument in own.arguments)
-                steps[expressions.levels[node]].append((FUNCTIONS[own.operation], k, arguments))
+                steps[expressions.levels[node]].append((expressions.function(node), k, arguments))
         with np.errstate(all="ignore"):
             _run(steps[CONSTANT], self._fixed)
         self._arranged = arranged

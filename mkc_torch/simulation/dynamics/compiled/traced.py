@@ -24,7 +24,8 @@ from mkc_torch.simulation.dynamics.compiled.symbol import (
     state_symbol,
 )
 from mkc_torch.simulation.dynamics.missing import MissingOutputs
-from mkc_torch.simulation.dynamics.observer import Observer, ObserverJump
+from mkc_torch.simulation.dynamics.observer import ObserverJump
+from mkc_torch.simulation.dynamics.rollout import Stepping
 from mkc_torch.simulation.dynamics.trajectory import Grid
 from mkc_torch.simulation.dynamics.varying import Acting
 from mkc_torch.simulation.names import Names
@@ -37,28 +38,24 @@ _FEWEST = 16
 """Smallest number of samples, plus the number of parameters, that distinguishes the time axis from other axes."""
 
 
-class Traceable(Protocol):
+class Traceable(Stepping, Protocol):
     """The interface of a prepared system that tracing uses.
 
     Attributes:
-        grid: the grid times.
         rows: (N,), grid index of each sample.
         begins: (N,), True where a run starts.
         measured: (N, m), the recorded outputs.
         missing: where outputs are missing; None where none is.
         guess: (G, n), a first guess of the states.
         inputs: (S, u), the recorded inputs at the stations.
-        observer: the observer that corrects the states; None in open loop.
     """
 
-    grid: Grid
     rows: Int[Tensor, " N"]
     begins: Bool[Tensor, " N"]
     measured: Float[Tensor, "N m"]
     missing: MissingOutputs | None
     guess: Float[Tensor, "G n"]
     inputs: Float[Tensor, "S u"]
-    observer: Observer | None
 
     def first_states(self, theta: Tensor, changes: Changes) -> tuple[Tensor, list[str]]: ...
     def with_memories(self, states: Tensor, memories: Sequence[str]) -> Tensor: ...
@@ -82,7 +79,8 @@ class Traced:
     Attributes:
         memories: the state that each internal state starts equal to; empty to start at 0.
         first: initial states of the runs, K w nodes.
-        ends, middle: rates at the ends (2, G-1) and in the middle (G-1,) of each interval.
+        ends, middle: rates at the ends (2, G-1) and in the middle (G-1,) of each interval; those of a simulation that
+            steps are at the left ends (1, G-1).
         new: innovations of an observer at the samples; None without an observer.
         outputs: outputs at the samples; None where they cannot be traced, as with effects across samples.
         places: indices of the states that an observer corrects.
@@ -139,6 +137,7 @@ def _traced(system: Traceable, meaning: Meaning, size: int, stations: int, sampl
         return state_symbol(trace, samples, width)
 
     rates = system.rate(theta, changes, _at_stations(system, meaning, parameters))(state_symbol(trace, stations, width))
+    at_ends, in_the_middle = _arrangements(system.grid)
     acting = _at_samples(system, meaning, parameters)
     jump = system.jump(theta, changes, acting)
     new = None if jump is None else block(jump.measured - jump.predict(at_samples()), samples, _as_is)
@@ -149,8 +148,8 @@ def _traced(system: Traceable, meaning: Meaning, size: int, stations: int, sampl
     return Traced(
         memories,
         CompiledBlock(e, as_nodes(begin, trace).nodes.reshape(-1).tolist(), *leaves, _as_is),
-        block(rates, stations, _at_ends),
-        block(rates, stations, _in_the_middle),
+        block(rates, stations, at_ends),
+        block(rates, stations, in_the_middle),
         new,
         outputs,
         () if jump is None else jump.places,
@@ -214,9 +213,18 @@ def _as_is(column: Array) -> Array:
     return column
 
 
+def _arrangements(grid: Grid) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    """Functions that rearrange values at the stations to the ends and the middle of the intervals."""
+    return (_at_ends, _in_the_middle) if grid.map_step is None else (_at_left_ends, _as_is)
+
+
 def _at_ends(column: Array) -> Array:
     """Rearrange values at the stations to the ends of the intervals, (2, G-1)."""
     return np.ascontiguousarray(column.reshape(-1, 3)[:, ::2].T)
+
+
+def _at_left_ends(column: Array) -> Array:
+    return column[None]
 
 
 def _in_the_middle(column: Array) -> Array:
