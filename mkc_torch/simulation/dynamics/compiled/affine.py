@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from mkc_torch.simulation.dynamics.compiled.expressions import Array
 from mkc_torch.simulation.dynamics.loops.machine_code import machine_code
-from mkc_torch.simulation.dynamics.loops.recurrence import pass_on
+from mkc_torch.simulation.dynamics.loops.recurrence import pass_on, pass_on_many
 
 _FEW = 128
 """Number of grid times up to which products over 1, 2, 4 ... intervals replace halving."""
+
+_MANY = 6
+"""Number of states from which their values at a grid time are neighbours in memory."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,11 @@ class Affine:
 
     def solved(self, source: Array, level: int = 0) -> Array:
         """Solve for δ given v, (w, K, G) each."""
+        many = None if self.products or len(source) < _MANY else machine_code(pass_on_many)
+        if many is not None:
+            by_time = np.array(np.moveaxis(source, -1, 0), order="C")
+            many(self._by_time, by_time)
+            return np.moveaxis(by_time, 0, -1)
         compiled = None if self.products else machine_code(pass_on)
         if compiled is not None:
             values = np.array(source, order="C")
@@ -74,6 +83,10 @@ class Affine:
             values = np.concatenate([values[..., :shift], later], -1)
             shift *= 2
         return values
+
+    @cached_property
+    def _by_time(self) -> Array:
+        return np.ascontiguousarray(np.moveaxis(self.carries[0], -1, 0))
 
 
 def multiplied(left: Array, right: Array) -> Array:
