@@ -19,6 +19,7 @@ from mkc_torch.simulation.dynamics.user_functions import kinematic
 from mkc_torch.simulation.fmu import is_of_an_fmu
 from mkc_torch.simulation.load import file_of
 from mkc_torch.simulation.parameter import Parameter, known_parameters
+from mkc_torch.simulation.stepped.mujoco.description import Description
 from mkc_torch.simulation.stepped.mujoco.stepper import is_of_a_model
 
 if TYPE_CHECKING:
@@ -155,9 +156,15 @@ def _loaded(kind: type, folder: Path | None) -> str | None:
     except ValueError:  # on another drive
         return None
     if of_a_model:
-        fitted = f", fitted={kind.description.fitted!r}" if is_of_a_model(kind) and kind.description.fitted else ""
-        return f"{kind.__name__} = {of_a_model}({json.dumps(way, ensure_ascii=False)}, __file__{fitted})"
+        chosen = _chosen(kind.description) if is_of_a_model(kind) else ""
+        return f"{kind.__name__} = {of_a_model}({json.dumps(way, ensure_ascii=False)}, __file__{chosen})"
     return f"{kind.__name__} = base_class({json.dumps(f'{way}:{kind.__name__}', ensure_ascii=False)}, __file__)"
+
+
+def _chosen(model: Description) -> str:
+    """Return the arguments that choose the numbers and joints of a MuJoCo model."""
+    fitted = f", fitted={model.fitted!r}" if model.fitted else ""
+    return fitted if model.whole is None else f"{fitted}, joints={tuple(model.positions)!r}"
 
 
 def _parameters(system: Dynamics, theta: Sequence[float]) -> list[str]:

@@ -52,7 +52,7 @@ def first_guess(
             known[name] = despiked(recording[name], at, begins)
     for name, rate in kinematic.items():
         if name in known and rate not in known:
-            known[rate] = _slope(known[name], at, begins)
+            known[rate] = slope_of(known[name], at, begins)
     columns = []
     for name in system.states:
         if name in known:
@@ -91,7 +91,7 @@ def despiked(values: Float[Tensor, " N"], time: Float[Tensor, " N"], begins: Boo
     return torch.where(away > _FAR * usual + 1e-9 * values.abs().amax(), line, values)
 
 
-def _slope(values: Float[Tensor, " N"], time: Float[Tensor, " N"], begins: Bool[Tensor, " N"]) -> Float[Tensor, " N"]:
+def slope_of(values: Float[Tensor, " N"], time: Float[Tensor, " N"], begins: Bool[Tensor, " N"]) -> Float[Tensor, " N"]:
     """Slope of the least-squares line through the window around each sample, per s."""
     t, y = _windows(time, begins), _windows(values, begins)
     t, y = t - t.mean(-1, keepdim=True), y - y.mean(-1, keepdim=True)

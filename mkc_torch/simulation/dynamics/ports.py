@@ -73,7 +73,9 @@ class PortContext:
         """
         system = self.system
         places = {}
-        forces, constants = ({}, ()) if system.steps is None else (system.steps.forces, system.steps.constants)
+        steps = system.steps
+        forces, constants = ({}, ()) if steps is None else (steps.forces, steps.constants)
+        without = (*forces, *constants, *(() if steps is None else steps.followed))
         free = [state for state in system.states if state not in self.kinematic and state not in forces.values()]
         for state in free:
             parts = self._parts(state)
@@ -93,7 +95,7 @@ class PortContext:
             levels = {"level": first, "other level": second} if both else {}
             port = self._rate_port(first, "exchange", {"own": first, "other": second, **sideways, **levels})
             places[f"exchange of {first} and {second}"] = replace(port, channels=(first, second))
-        for name in (name for name in system.inputs if name not in forces and name not in constants):
+        for name in (name for name in system.inputs if name not in without):
             actuator = {} if name in self._surroundings.values() else {"actuator": name}
             places[f"input {name}"] = Port(
                 (name,),

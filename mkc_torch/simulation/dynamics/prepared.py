@@ -121,6 +121,7 @@ class PreparedDynamics(CheckedDynamics):
         """Inputs at the stations."""
         known = self.known_inputs
         holds = dict.fromkeys(self.system.inputs, self.system.input_hold) | self.input_hold
+        holds |= dict.fromkeys(() if self.system.steps is None else self.system.steps.followed, "linear")
         columns = [
             inputs_between(inputs[:, [k]], how, known.time, known.begins, self._input_clock)
             for k, how in enumerate(holds.values())

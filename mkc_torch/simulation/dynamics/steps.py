@@ -20,6 +20,7 @@ class Steps:
         positions: state that is a position, to the state that is its speed.
         forces: input that is a force acting along a speed, to this speed; its column is 0 in every recording.
         constants: input that is the change of a constant of the simulation; its column is 0 in every recording.
+        followed: inputs that are recorded motion; effects do not act on them, and they are linear between samples.
         rollout: from a state (1, n), inputs (T, u) and the parameters to the states after each of T steps, (T, n),
             without derivatives.
     """
@@ -28,6 +29,7 @@ class Steps:
     positions: Mapping[str, str]
     forces: Mapping[str, str]
     constants: tuple[str, ...]
+    followed: tuple[str, ...]
     rollout: Callable[[Tensor, Tensor, Any], Tensor]
 
 

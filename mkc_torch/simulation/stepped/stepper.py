@@ -40,7 +40,7 @@ class Stepper(Dynamics):
 
     Attributes:
         states: names of the states.
-        inputs: names of the columns that drive the simulation; they are held over each step.
+        inputs: names of the columns that drive the simulation; they are held from a sample to the next.
         outputs: names of the columns that it predicts; default: the states that are columns of the recording.
         positions: state that is a position, to the state that is its speed.
         forces: force that effects may add, to the state that is the speed along which it acts. A force at each joint
@@ -49,6 +49,8 @@ class Stepper(Dynamics):
         constants: numbers that the simulation takes as known and effects may change, such as a payload: value, or
             :class:`Parameter`, by name. ``step`` reads them like parameters, as ``p.payload``; outside of their bounds
             it fails.
+        followed: inputs that are recorded motion, such as that of a part which is not simulated; they are linear
+            between samples, and effects do not act on them.
         initial: guess of the initial value by state, for states that are not measured; default 0.
         units: unit by state, input or force; the unit of a force is that of the sizes of effects there.
         time_step: length of a step in s. Samples are as many steps apart as is nearest, at least one.
@@ -79,6 +81,7 @@ class Stepper(Dynamics):
     positions: Mapping[str, str] = {}
     forces: Mapping[str, str] = {}
     constants: Mapping[str, float | Parameter] = {}
+    followed: tuple[str, ...] = ()
     time_step: float = 0.0
     input_hold = "held"
 
@@ -130,7 +133,9 @@ class Stepper(Dynamics):
 
     @property
     def steps(self) -> Steps:  # type: ignore[override]
-        return Steps(self.time_step, self.positions, self.forces, tuple(self.constants), self._rolled_out)
+        return Steps(
+            self.time_step, self.positions, self.forces, tuple(self.constants), self.followed, self._rolled_out
+        )
 
     @property
     def columns(self) -> frozenset[str]:

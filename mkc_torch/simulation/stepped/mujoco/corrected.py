@@ -54,7 +54,7 @@ def corrected_xml(
             continue
         for array, index, factor in number.places:
             getattr(spec.actuators[place], _OF_ACTUATORS[array])[index[1]] = factor * value
-    joints = list(description.positions)
+    joints = list(description.all.positions)
     for (joint, attribute), amount in added.items():
         part = spec.joints[joints.index(joint)]
         _set(part, attribute, _linear(getattr(part, attribute)) + amount)

@@ -38,6 +38,7 @@ class Description:
         units: by state, input, force and sensor.
         initial: value of each state at the model's initial configuration.
         fitted: the patterns that chose the numbers; None for the default.
+        whole: the model with all joints, where only some of them move by simulation; else None.
     """
 
     path: Path
@@ -53,6 +54,17 @@ class Description:
     units: Mapping[str, str]
     initial: Mapping[str, float]
     fitted: tuple[str, ...] | None
+    whole: Description | None = None
+
+    @property
+    def all(self) -> Description:
+        """The model with all joints."""
+        return self if self.whole is None else self.whole
+
+    @property
+    def followed(self) -> tuple[str, ...]:
+        """Joints that move as they were recorded."""
+        return tuple(name for name in self.all.positions if name not in self.positions)
 
     @property
     def time_step(self) -> float:

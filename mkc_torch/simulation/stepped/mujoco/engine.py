@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -18,9 +19,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Array = NDArray[np.float64]
+    Places = NDArray[np.int64]
+    Mask = NDArray[np.bool_]
 
 _STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _CONTROL = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED
+
+_HEAVY = 1e4
+"""Inertia of a joint that is followed, as a multiple of the largest of the model; far larger ones slow MuJoCo down."""
 
 _HUGE = 1e6
 """Size of a state or a control beyond which a step is not computed; no mechanism reaches it."""
@@ -40,6 +46,8 @@ class Engine:
         self.model.opt.tolerance = 1e-12
         # a state that diverges stays as it is, and is returned as NaN
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        self._layout = _Layout.of(description)
+        _hold_followed(self.model, self._layout)
         self._pools: dict[int, tuple[Any, list[Any]]] = {}
         self._constants = tuple(known.parameter.value for known in description.constants.values())
         self._size = mujoco.mj_stateSize(self.model, _STATE)
@@ -48,27 +56,50 @@ class Engine:
         """The states (B, n) after one step, and ``sensordata`` (B, s) before it; NaN where a state diverges.
 
         Args:
-            x, u, tau: (B, n), (B, controls), (B, joints).
+            x, u, tau: (B, n), (B, inputs), (B, forces).
             parameters: value by name.
         """
-        after, sensed = self._advanced(x, np.concatenate([u, tau], 1)[:, None], parameters)
-        return after[:, 0], sensed[:, 0]
+        usable = _usable(x) & _usable(u) & _usable(tau)
+        states, control = self._layout.states(x, u), self._layout.control(u, tau)
+        after, sensed = self._advanced(states, control[:, None], usable, parameters)
+        return after[:, 0][:, self._layout.own], sensed[:, 0]
 
     def rolled_out(self, x: Array, u: Array, tau: Array, parameters: Mapping[str, float]) -> Array:
         """The states (T, n) after each of T steps from one state; NaN from where they diverge.
 
         Args:
-            x, u, tau: (n,), (T, controls), (T, joints).
+            x, u, tau: (n,), (T, inputs), (T, forces).
             parameters: value by name.
         """
-        return self._advanced(x[None], np.concatenate([u, tau], 1)[None], parameters)[0][0]
+        if self._layout.followed:
+            return self._rolled_along(x, u, tau, parameters)
+        usable = (_usable(x) & _usable(u).all() & _usable(tau).all())[None]
+        return self._advanced(x[None], self._layout.control(u, tau)[None], usable, parameters)[0][0]
 
-    def _advanced(self, x: Array, control: Array, parameters: Mapping[str, float]) -> tuple[Array, Array]:
-        """States (B, T, n) and ``sensordata`` (B, T, s) over T steps with controls (B, T, c)."""
-        for name, number in self.description.numbers.items():
-            number.write(self.model, parameters[name])
-        self._set_constants(parameters)
-        usable = _usable(x) & _usable(control).all(1)
+    def _rolled_along(self, x: Array, u: Array, tau: Array, parameters: Mapping[str, float]) -> Array:
+        """The states (T, n), where the joints that are followed are set before each step."""
+        self._set(parameters)
+        layout, model, data = self._layout, self.model, mujoco.MjData(self.model)
+        first, joints, controls = layout.states(x[None], u[:1])[0], layout.joints, model.nu
+        data.qpos[:], data.qvel[:], data.act[:] = np.split(first, [joints, 2 * joints])
+        given, control, followed = layout.states(np.zeros((len(u), len(x))), u), layout.control(u, tau), layout.followed
+        places, speeds = given[:, followed], given[:, [joints + joint for joint in followed]]
+        found = np.empty((len(u), len(first)))
+        for k in range(len(u)):
+            data.qpos[followed], data.qvel[followed] = places[k], speeds[k]
+            data.ctrl[:], data.qfrc_applied[:], data.qacc_warmstart[:] = (
+                control[k, :controls],
+                control[k, controls:],
+                0.0,
+            )
+            mujoco.mj_step(model, data)
+            found[k, :joints], found[k, joints : 2 * joints], found[k, 2 * joints :] = data.qpos, data.qvel, data.act
+        found[np.maximum.accumulate(~_usable(found))] = np.nan
+        return found[:, layout.own]
+
+    def _advanced(self, x: Array, control: Array, usable: Mask, parameters: Mapping[str, float]) -> tuple[Array, Array]:
+        """All states (B, T, n) and ``sensordata`` (B, T, s) over T steps with all controls (B, T, c)."""
+        self._set(parameters)
         rows, n = len(x), x.shape[1]
         initial = np.zeros((rows, self._size))
         initial[:, 1 : 1 + n] = np.where(usable[:, None], x, 0.0)
@@ -86,8 +117,10 @@ class Engine:
         found[~(usable[:, None] & _usable(found))] = np.nan
         return found, np.where(usable[:, None, None], sensed, np.nan)
 
-    def _set_constants(self, parameters: Mapping[str, float]) -> None:
-        """Write the constants, as in the file where they are not given, and what MuJoCo derives from them."""
+    def _set(self, parameters: Mapping[str, float]) -> None:
+        """Write the numbers and constants, as in the file where they are not given, and what MuJoCo derives of them."""
+        for name, number in self.description.numbers.items():
+            number.write(self.model, parameters[name])
         known = self.description.constants
         values = tuple(parameters.get(name, constant.parameter.value) for name, constant in known.items())
         if values != self._constants:
@@ -107,6 +140,78 @@ class Engine:
             data = [mujoco.MjData(self.model) for _ in range(max(threads, 1))]
             self._pools[process] = rollout.Rollout(nthread=threads), data
         return self._pools[process]
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where states, inputs and forces of a simulation are among those of MuJoCo.
+
+    Attributes:
+        states_in_all: number of all states.
+        controls_in_all: number of all controls, and then of all joints.
+        own: place of each state.
+        controls, forces: place of each input that is a control, and of each force.
+        followed: number of each joint that is followed.
+        joints: number of all joints.
+        heavy: inertia of the joints that are followed.
+    """
+
+    states_in_all: int
+    controls_in_all: int
+    own: Places
+    controls: list[int]
+    forces: list[int]
+    followed: list[int]
+    joints: int
+    heavy: float
+
+    @classmethod
+    def of(cls, description: Description) -> _Layout:
+        whole = description.all
+        joints, controls = list(whole.positions), len(whole.inputs)
+        return cls(
+            len(whole.states),
+            controls + len(joints),
+            np.array([whole.states.index(name) for name in description.states]),
+            [whole.inputs.index(name) for name in description.inputs if name in whole.inputs],
+            [controls + list(whole.forces).index(name) for name in description.forces],
+            [joints.index(name) for name in description.followed],
+            len(joints),
+            _HEAVY * float(description.model.dof_M0.max()),
+        )
+
+    def states(self, x: Array, u: Array) -> Array:
+        """All states (B, all), from those that are simulated and the inputs (B, u)."""
+        found = np.zeros((len(x), self.states_in_all))
+        found[:, self.own] = x
+        moved = u[:, len(self.controls) :]
+        found[:, self.followed] = moved[:, ::3]
+        found[:, [self.joints + joint for joint in self.followed]] = moved[:, 1::3]
+        return found
+
+    def control(self, u: Array, tau: Array) -> Array:
+        """All controls, then the forces at all joints, (B, all)."""
+        found = np.zeros((len(u), self.controls_in_all))
+        found[:, self.controls] = u[:, : len(self.controls)]
+        found[:, self.forces] = tau
+        first = self.controls_in_all - self.joints
+        found[:, [first + joint for joint in self.followed]] = self.heavy * u[:, len(self.controls) + 2 :: 3]
+        return found
+
+
+def _hold_followed(model: mujoco.MjModel, layout: _Layout) -> None:
+    """Make the joints that are followed so heavy that only the force for their recorded acceleration moves them."""
+    joints = layout.followed
+    model.dof_armature[joints] = layout.heavy
+    model.dof_damping[joints] = 0.0
+    model.dof_frictionloss[joints] = 0.0
+    model.jnt_stiffness[joints] = 0.0
+    model.jnt_limited[joints] = 0
+    idle = [k for k in range(model.nu) if k not in layout.controls]
+    model.actuator_gainprm[idle] = 0.0
+    model.actuator_biasprm[idle] = 0.0
+    if joints:
+        mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def _silent(message: str) -> None:

@@ -17,6 +17,7 @@ from mkc_torch.simulation.foreign.model_file import model_file
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.parameter import SimulationError
 from mkc_torch.simulation.stepped.mujoco.description import Description, described
+from mkc_torch.simulation.stepped.mujoco.following import with_followed, with_moving
 from mkc_torch.simulation.stepped.stepper import Stepper
 
 if TYPE_CHECKING:
@@ -67,24 +68,36 @@ class MujocoStepper(Stepper):
         own = copy.copy(self)
         own.__dict__.pop("_evaluation", None)
         own.outputs = measured
+        if self.followed and self.followed[0] not in recording:  # a prepared recording has them already
+            recording = with_followed(recording, self.description)
         return super(MujocoStepper, own).prepare(recording)
 
     @property
+    def columns(self) -> frozenset[str]:
+        # the motion and the drives of joints that are followed take part through the former alone
+        return super().columns | frozenset(self.description.all.states) | frozenset(self.description.all.inputs)
+
+    @property
     def saved(self) -> Mapping[str, object]:  # type: ignore[override]
-        """The patterns that chose the fitted numbers."""
-        patterns = self.description.fitted
-        return {} if patterns is None else {"fitted": list(patterns)}
+        """The patterns that chose the fitted numbers, and the joints that move by simulation if not all do."""
+        found, patterns = self.description, self.description.fitted
+        joints = {} if found.whole is None else {"joints": list(found.positions)}
+        return joints if patterns is None else {"fitted": list(patterns), **joints}
 
     def correction(self, state: Mapping[str, Any], recording: Recording) -> DynamicsCorrection:
-        patterns = state.get("fitted")
-        if is_of_a_model(type(self)) and patterns != self.saved.get("fitted"):
-            return load_mjcf(self.description.path, patterns).correction(state, recording)
+        chosen = {key: state[key] for key in ("fitted", "joints") if key in state}
+        if is_of_a_model(type(self)) and chosen != self.saved:
+            return load_mjcf(self.description.path, **chosen).correction(state, recording)
         return super().correction(state, recording)
+
+    def moving(self, joints: Sequence[str]) -> MujocoStepper:
+        """Return the model with only some joints moved by simulation; see :func:`load_mjcf`."""
+        return _class_of(with_moving(self.description.all, joints))()
 
     def __reduce__(self) -> Any:
         state = {name: value for name, value in vars(self).items() if name not in ("_engine", "_evaluation")}
         if is_of_a_model(type(self)):  # such a class cannot be imported by name
-            return load_mjcf, (str(self.description.path), self.description.fitted), state
+            return load_mjcf, (str(self.description.path), self.description.fitted, self.saved.get("joints")), state
         return type(self), (), state
 
     @cached_property
@@ -94,33 +107,46 @@ class MujocoStepper(Stepper):
         return Engine(self.description)
 
 
-def load_mjcf(path: str | Path, fitted: Sequence[str] | None = None) -> MujocoStepper:
+def load_mjcf(
+    path: str | Path, fitted: Sequence[str] | None = None, joints: Sequence[str] | None = None
+) -> MujocoStepper:
     """Load a MuJoCo model, MJCF or URDF.
 
     Args:
         path: of the file.
         fitted: patterns of the numbers to fit, "joint:*.damping" say; None for those that the file gives.
+        joints: those that move by simulation; the others move as they were recorded. None for all.
 
     Raises:
-        MjcfError: MuJoCo refuses the file, or the model has parts that cannot be diagnosed.
+        MjcfError: MuJoCo refuses the file, the model has parts that cannot be diagnosed, or it has no such joint.
         ImportError: MuJoCo is not installed.
     """
-    return _class_of(described(Path(path), fitted))()
+    return _class_of(_described(Path(path), fitted, joints))()
 
 
-def mjcf_class(path: str | Path, file: str | None = None, fitted: Sequence[str] | None = None) -> type[MujocoStepper]:
+def mjcf_class(
+    path: str | Path,
+    file: str | None = None,
+    fitted: Sequence[str] | None = None,
+    joints: Sequence[str] | None = None,
+) -> type[MujocoStepper]:
     """A class of a MuJoCo model, to derive from like :class:`mkc_torch.simulation.Stepper`.
 
     Args:
         path: of the MJCF or URDF file.
         file: ``__file__`` of the calling file, to whose folder the path is relative; None for the current folder.
-        fitted: as in :func:`load_mjcf`.
+        fitted, joints: as in :func:`load_mjcf`.
 
     Raises:
-        MjcfError: MuJoCo refuses the file, or the model has parts that cannot be diagnosed.
+        MjcfError: MuJoCo refuses the file, the model has parts that cannot be diagnosed, or it has no such joint.
         ImportError: MuJoCo is not installed.
     """
-    return _class_of(described(model_file(path, file), fitted))
+    return _class_of(_described(model_file(path, file), fitted, joints))
+
+
+def _described(path: Path, fitted: Sequence[str] | None, joints: Sequence[str] | None) -> Description:
+    found = described(path, fitted)
+    return found if joints is None else with_moving(found, joints)
 
 
 def is_of_a_model(kind: type) -> TypeGuard[type[MujocoStepper]]:
@@ -141,6 +167,7 @@ def _class_of(found: Description) -> type[MujocoStepper]:
         "inputs": found.inputs,
         "positions": found.positions,
         "forces": found.forces,
+        "followed": tuple(name for name in found.inputs if name not in found.all.inputs),
         "parameters": found.parameters,
         "constants": {name: constant.parameter for name, constant in found.constants.items()},
         "units": found.units,
