@@ -40,6 +40,7 @@ from mkc_torch.cli.simulation_option import (
     COLUMNS_METAVAR,
     FIT_HELP,
     INPUT_HOLD_HELP,
+    JOINTS_HELP,
     OWN_SIMULATION,
     RUN_COLUMN_HELP,
     checked_columns,
@@ -48,6 +49,7 @@ from mkc_torch.cli.simulation_option import (
     checked_simulation,
     checked_units,
     parsed_fit,
+    parsed_joints,
 )
 from mkc_torch.cli.steps import Steps
 from mkc_torch.cli.units_option import (
@@ -111,6 +113,7 @@ def diagnose(
         list[str] | None,
         typer.Option(metavar="NUMBERS", help=FIT_HELP),
     ] = None,
+    joints: Annotated[str | None, typer.Option(metavar="JOINTS", help=JOINTS_HELP)] = None,
     suspect: Annotated[
         list[str] | None,
         typer.Option(metavar="EFFECTS", help=f"Suspected effects to score next to the findings: {SUSPECTED}."),
@@ -152,6 +155,7 @@ def diagnose(
         noise=_noise(noise or []),
         input_hold=checked_input_hold(input_hold or []),
         fit=parsed_fit(fit or [], simulation),
+        joints=parsed_joints(joints, simulation),
         suspect=tuple(suspect or []),
         level=_level(level),
         surrogates=_surrogates(surrogates, level, quick=quick),
@@ -166,9 +170,11 @@ def diagnose(
     with loading():
         from mkc_torch._parallel.processes import in_processes, keep_memory, one_thread
         from mkc_torch.cli.diagnosis_files import simulation_of
+        from mkc_torch.cli.joints import by_joints
     total, failed, doubtful, left = 0, 0, False, list(recordings)
     with interrupts_reported(lambda: not_written(left, output)):
         _refuse_unusable(request, simulation_of)
+        works = [(path, each) for path in recordings for each in by_joints(path, request)]
     one_thread()
     keep_memory()
     look = ConsoleStyle.of(out())
@@ -176,14 +182,12 @@ def diagnose(
         raise typer.Exit(_all_together(output, request, look, recordings))
     with (
         interrupts_reported(lambda: not_written(left, output)),
-        progress(len(recordings), output, lines=True) as step,
+        progress(len(works), output, lines=True) as step,
         # a single recording is diagnosed in this process, so that its run can be shown
-        in_processes(
-            partial(_diagnosed, output, request, look, step if len(recordings) == 1 else None), recordings
-        ) as results,
+        in_processes(partial(_diagnosed, output, look, step if len(works) == 1 else None), works) as results,
     ):
-        for path, result in zip(recordings, results, strict=True):
-            step(f"diagnosing {path.name}")
+        for number, ((path, each), result) in enumerate(zip(works, results, strict=True)):
+            step(f"diagnosing {path.name}{''.join(f', {joint}' for joint in each.joints)}")
             outcomes = _waited_for(result, path)
             _print_outcomes(outcomes, step)
             total += len(outcomes)
@@ -191,17 +195,29 @@ def diagnose(
             doubtful = doubtful or any(outcome.doubtful for outcome in outcomes)
             if any(outcome.interrupted for outcome in outcomes):
                 raise KeyboardInterrupt
-            left.remove(path)
+            if number + 1 == len(works) or works[number + 1][0] != path:
+                left.remove(path)
+                _join(output / path.stem, [own for other, own in works if other == path], step)
             step(None)
     if total > 1 and failed:
         err().print(f"mkc: {failed} of {total} recordings were not diagnosed.", soft_wrap=True)
     raise typer.Exit(1 if failed else DOUBTFUL if doubtful else 0)
 
 
-def _diagnosed(output: Path, request: Request, look: ConsoleStyle, step: Steps | None, path: Path) -> list[Outcome]:
+def _diagnosed(output: Path, look: ConsoleStyle, step: Steps | None, work: tuple[Path, Request]) -> list[Outcome]:
     from mkc_torch.cli.diagnosis_files import diagnose_file
 
-    return diagnose_file(path, output / path.stem, request, look, step)
+    path, request = work
+    return diagnose_file(path, (output / path.stem).joinpath(*request.joints[:1]), request, look, step)
+
+
+def _join(folder: Path, requests: list[Request], step: Steps) -> None:
+    """Write the findings of all joints of a MuJoCo model into one file, if they were diagnosed one by one."""
+    from mkc_torch.cli.joints import write_joined
+
+    if len(requests) > 1 and (found := write_joined(folder, requests)) is not None:
+        with step.aside():
+            typer.echo(f"The model with the findings of all joints: {found}")
 
 
 def _all_together(output: Path, request: Request, look: ConsoleStyle, paths: list[Path]) -> int:

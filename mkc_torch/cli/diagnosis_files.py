@@ -32,6 +32,7 @@ from mkc_torch.recording.join_recordings import joint_name
 from mkc_torch.recording.recording import Recording, RecordingError
 from mkc_torch.report.diagnosis.verdict import RunPaths
 from mkc_torch.simulation.load import load_simulation, raised_in
+from mkc_torch.simulation.stepped.mujoco import MujocoStepper
 
 if TYPE_CHECKING:
     from mkc_torch.simulation import Simulation
@@ -52,9 +53,11 @@ def diagnose_file(
         request, note = decided(path, request)
         recording = read_recording(path, request)
         simulation = simulation_of(request)
+        if request.joints:
+            recording = _renamed(recording, f"{recording.name}, {', '.join(request.joints)}")
         claim_folder(folder, overwrite=request.force, files=WRITTEN)
     except Exception as error:
-        return [_failed(path, "", error)]
+        return [_failed(path, ", ".join(request.joints), error)]
     with folder_written(folder):
         parts, outcomes = list(_parts(recording, simulation, folder)), []
         for number, (label, part, place) in enumerate(parts, start=1):
@@ -326,7 +329,19 @@ def simulation_of(request: Request) -> Simulation:
     """
     if request.simulator_output is not None:
         return paired_simulation(request.simulator_output, request.columns)
-    return named_simulation(request.simulation, request.fit)
+    found = named_simulation(request.simulation, request.fit)
+    return found.moving(request.joints) if request.joints and isinstance(found, MujocoStepper) else found
+
+
+def _renamed(recording: Recording, name: str) -> Recording:
+    return Recording(
+        recording.columns,
+        name=name,
+        units=recording.units,
+        warnings=recording.warnings,
+        labels=recording.labels,
+        notes=recording.notes,
+    )
 
 
 def _failed(path: Path, label: str, error: Exception) -> Outcome:

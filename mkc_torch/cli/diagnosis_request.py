@@ -39,6 +39,7 @@ class Request:
     noise: Mapping[str, float] = field(default_factory=dict)
     input_hold: Mapping[str, str] = field(default_factory=dict)
     fit: tuple[str, ...] = ()
+    joints: tuple[str, ...] = ()
     suspect: tuple[str, ...] = ()
     level: float = LEVEL
     surrogates: int = SURROGATES

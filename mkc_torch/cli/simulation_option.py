@@ -31,6 +31,16 @@ FIT_HELP = (
     "Numbers of a model of MuJoCo to fit: joint:*.damping,actuator:*.kp; default: damping, armature, frictionloss, kp "
     "and kv that the file gives."
 )
+ALL, EACH = "all", "each"
+
+MOST_TOGETHER = 2
+"""Number of measured joints up to which all of them are simulated at once unless the user decides."""
+
+JOINTS_HELP = (
+    "Joints of a model of MuJoCo that are simulated at once, while the others follow their recorded positions: "
+    f"pan,lift; {ALL}; or {EACH}, one after the other (default for more than {MOST_TOGETHER} measured joints)."
+)
+
 RUN_COLUMN_HELP = "Column that separates the runs of a table; default: experiment, if any."
 
 
@@ -92,6 +102,26 @@ def parsed_fit(texts: Sequence[str], simulation: str | None) -> tuple[str, ...]:
     if not all(parts):
         raise typer.BadParameter("--fit has an empty part; write --fit joint:*.damping,actuator:*.kp.")
     return parts
+
+
+def parsed_joints(text: str | None, simulation: str | None) -> tuple[str, ...]:
+    """Return the names in ``--joints``; empty without it.
+
+    Raises:
+        typer.BadParameter: the simulation is no model of MuJoCo, or a name is empty.
+
+    Example:
+        >>> parsed_joints("pan, lift", "arm.xml"), parsed_joints(None, "arm.fmu")
+        (('pan', 'lift'), ())
+    """
+    if text is None:
+        return ()
+    if not is_model_of_mujoco(simulation or ""):
+        raise typer.BadParameter("--joints applies to a model of MuJoCo, MODEL.xml or MODEL.urdf; leave it out.")
+    names = tuple(part.strip() for part in text.split(","))
+    if not all(names):
+        raise typer.BadParameter(f"--joints has an empty part; write --joints pan,lift, {ALL} or {EACH}.")
+    return names
 
 
 def checked_units(conversions: list[str], label: str | None, simulation: str | None) -> dict[str, str]:

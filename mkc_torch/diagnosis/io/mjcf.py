@@ -13,44 +13,45 @@ if TYPE_CHECKING:
 
     from mkc_torch.diagnosis.model.term import Term
 
+Part = tuple[MujocoStepper, Sequence[float], Sequence["Term"], Sequence["Tensor"]]
+"""A diagnosed model: the simulation, its parameters, its effects and their sizes."""
+
 _ATTRIBUTES = {"coulomb_friction": "frictionloss", "linear_drag": "damping"}
 """Attribute of a joint by the effect that it expresses; its number is the effect's size."""
 
 
-def mjcf_source(
-    system: MujocoStepper, theta: Sequence[float], terms: Sequence[Term], gammas: Sequence[Tensor]
-) -> tuple[str, tuple[str, ...]]:
-    """Return the model's file with the fitted numbers and the findings that MJCF expresses, and the other findings.
+def mjcf_source(parts: Sequence[Part]) -> tuple[str, tuple[str, ...]]:
+    """Return a model's file with the fitted numbers and the findings that MJCF expresses, and the other findings.
 
     Args:
-        system: the diagnosed model.
-        theta: its parameters, then initial states, which a file has no room for.
-        terms, gammas: the effects and their sizes.
+        parts: the diagnosed model; several where its joints were diagnosed one by one.
 
     Returns:
         The MJCF, and a line for each finding that is not in it, which ``corrected.py`` has.
     """
     from mkc_torch.simulation.stepped.mujoco.corrected import corrected_xml
 
-    joints = {force: joint for joint, force in zip(system.positions, system.forces, strict=True)}
+    values: dict[str, float] = {}
     added: dict[tuple[str, str], float] = {}
     changed: dict[str, float] = {}
-    others = []
-    for term, gamma in zip(terms, gammas, strict=True):
-        if term.port.startswith("constant "):
-            name = term.port.removeprefix("constant ")
-            changed[name] = changed.get(name, 0.0) + float(gamma[0])
-            continue
-        joint = joints.get(term.port.removeprefix("entry of "))
-        attribute = _ATTRIBUTES.get(term.effect.id)
-        if joint is None or attribute is None or term.driver is not None or not float(gamma[0]) > 0.0:
-            others.append(f"{term.effect.display_name} at the {term.port.removeprefix('entry of ')}")
-            continue
-        added[joint, attribute] = added.get((joint, attribute), 0.0) + float(gamma[0])
-    values = dict(zip(system.parameters, theta, strict=False))
+    others: list[str] = []
+    for system, theta, terms, gammas in parts:
+        joints = {force: joint for joint, force in zip(system.positions, system.forces, strict=True)}
+        values |= dict(zip(system.parameters, theta, strict=False))
+        for term, gamma in zip(terms, gammas, strict=True):
+            if term.port.startswith("constant "):
+                name = term.port.removeprefix("constant ")
+                changed[name] = changed.get(name, 0.0) + float(gamma[0])
+                continue
+            joint = joints.get(term.port.removeprefix("entry of "))
+            attribute = _ATTRIBUTES.get(term.effect.id)
+            if joint is None or attribute is None or term.driver is not None or not float(gamma[0]) > 0.0:
+                others.append(f"{term.effect.display_name} at the {term.port.removeprefix('entry of ')}")
+                continue
+            added[joint, attribute] = added.get((joint, attribute), 0.0) + float(gamma[0])
     only = f" Only corrected.py has: {'; '.join(others)}." if others else ""
     note = f"With the findings of mkc diagnose.{only}".replace("--", "-")  # a comment cannot hold two hyphens
-    return corrected_xml(system.description, values, added, changed, note), tuple(others)
+    return corrected_xml(parts[0][0].description, values, added, changed, note), tuple(others)
 
 
 def mjcf_changes(system: MujocoStepper, text: str) -> str:

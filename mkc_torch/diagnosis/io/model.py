@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from mkc_torch.diagnosis.declared import checked_input_hold
-from mkc_torch.diagnosis.io.mjcf import mjcf_changes, mjcf_source
+from mkc_torch.diagnosis.io.mjcf import Part, mjcf_changes, mjcf_source
 from mkc_torch.diagnosis.io.python_source import SourceError, python_source
 from mkc_torch.diagnosis.io.selected_sizes import refuse_unselected, selected, without_runs
 from mkc_torch.diagnosis.io.term_entry import term_entry
@@ -240,20 +240,19 @@ class DiagnosedModel(CorrectingModel):
         """Return a MuJoCo model's file with the fitted numbers and findings, and the findings that it cannot express.
 
         Raises:
-            SourceError: the simulation is no MuJoCo model.
+            SourceError: the simulation is no MuJoCo model; also in the two methods that follow.
         """
-        if not isinstance(self.source, MujocoStepper):
-            raise SourceError(f'Only a MuJoCo model can be exported as MJCF, but the model is of "{self.simulation}".')
-        return mjcf_source(self.source, self.theta.tolist(), self.terms, tuple(self.gammas))
+        return mjcf_source([self.mjcf_part()])
 
     def mjcf_changes(self) -> str:
-        """Return what :meth:`to_mjcf` changes in a MuJoCo model's file, as a unified diff.
+        """Return what :meth:`to_mjcf` changes in a MuJoCo model's file, as a unified diff."""
+        return mjcf_changes(self.mjcf_part()[0], self.to_mjcf()[0])
 
-        Raises:
-            SourceError: the simulation is no MuJoCo model.
-        """
-        text = self.to_mjcf()[0]
-        return mjcf_changes(self.source, text) if isinstance(self.source, MujocoStepper) else ""
+    def mjcf_part(self) -> Part:
+        """Return what a MuJoCo model's file is written from."""
+        if not isinstance(self.source, MujocoStepper):
+            raise SourceError(f'Only a MuJoCo model can be exported as MJCF, but the model is of "{self.simulation}".')
+        return self.source, self.theta.tolist(), self.terms, tuple(self.gammas)
 
     @staticmethod
     def from_json(

@@ -23,6 +23,12 @@ _STEP = float(np.finfo(np.float64).eps) ** 0.5
 _NEAR = 1e-3
 """Distance of points, as a share of each state, input and parameter, over which derivatives are the same."""
 
+_CLOSE = 0.1
+"""Distance of neighbouring points, as a share of each state and input, over which derivatives are interpolated."""
+
+_FEW = 2000
+"""Number of points below which each has derivatives of its own."""
+
 _BATCH = 200_000
 """Most steps in one call."""
 
@@ -113,12 +119,15 @@ class StepperEvaluation(CachedEvaluation):
     def slope(self, outputs: bool, at: EvaluationPoints, group: Group, number: int) -> Array:
         """Derivatives by a variable of a group, (S, k); those of points nearby where known.
 
-        They are differences of many steps, and change no value: only how fast a solution converges.
+        They are differences of many steps, and change no value: only how fast a solution converges. Along a long
+        course of small steps they are interpolated.
         """
         known = self._slopes.get((outputs, group, number))
         if known is None or not self._near(at, known[0]):
-            found = self._slopes_by(outputs, at, group, [number])[..., 0]
-            known = self._slopes[outputs, group, number] = at, found
+            places = _along(at)
+            base = self.values(outputs, at)[places]
+            found = self.columns(outputs, at.rows(places), at.parts[3], group, [number], base)[..., 0]
+            known = self._slopes[outputs, group, number] = at, _between(found, places, len(at.parts[0]))
         return known[1]
 
     def _near(self, at: EvaluationPoints, known: EvaluationPoints) -> bool:
@@ -163,6 +172,32 @@ class StepperEvaluation(CachedEvaluation):
                 f"{stepper.name}.step: expected states of shape {states.shape}, like x, but got {after.shape}."
             )
         return np.asarray((after - states) / stepper.time_step)
+
+
+def _along(at: EvaluationPoints) -> NDArray[np.int64]:
+    """The points between which derivatives are interpolated; with the first and the last, and both sides of a jump."""
+    if len(at.parts[0]) < _FEW:
+        return np.arange(len(at.parts[0]))
+    table = np.concatenate(at.parts[1:3], 1)
+    size = np.sqrt(np.square(table).mean(0))
+    with np.errstate(all="ignore"):  # points that a diverging solution reached
+        moves = (np.abs(np.diff(table, axis=0)) / np.where(size > 0.0, size, 1.0)).max(1, initial=0.0)
+    moves = np.where(moves < _CLOSE, moves, 2.0 * _CLOSE)
+    kept = np.ones(len(table), dtype=bool)
+    kept[1:-1] = np.diff(np.floor(np.cumsum(moves) / _CLOSE), prepend=0.0)[:-1] > 0
+    kept[:-1] |= moves >= _CLOSE
+    return np.flatnonzero(kept)
+
+
+def _between(values: Array, places: NDArray[np.int64], count: int) -> Array:
+    """Values (p, k) at some of the points, interpolated to all, (count, k)."""
+    if len(places) == count:
+        return values
+    at = np.arange(count)
+    after = np.searchsorted(places, at).clip(1, len(places) - 1)
+    first, last = places[after - 1], places[after]
+    share = ((at - first) / (last - first))[:, None]
+    return (1.0 - share) * values[after - 1] + share * values[after]
 
 
 def _moved(values: Array, place: int, step: float) -> Array:

@@ -47,7 +47,7 @@ def corrected_xml(
     """
     spec = mujoco.MjSpec.from_file(str(description.path))
     for name, value in values.items():
-        number = description.numbers[name]
+        number = description.all.numbers[name]
         kind, place = number.part
         if kind == "joint":
             _set(spec.joints[place], number.label.rpartition(".")[2], value)
@@ -60,7 +60,7 @@ def corrected_xml(
         _set(part, attribute, _linear(getattr(part, attribute)) + amount)
     other = copy.copy(description.model)
     for name, change in changed.items():
-        constant = description.constants[name]
+        constant = description.all.constants[name]
         constant.write(other, constant.parameter.value + change, description.model)
         constant.write_to_spec(spec, other)
     if note:
