@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -33,15 +33,21 @@ _BATCH = 200_000
 """Most steps in one call."""
 
 
+SingleStep = Callable[[Sequence[float], Sequence[float], Sequence[float], Names], Sequence[float]]
+"""The states after a step, from the states, the inputs, the forces, and the parameters and constants."""
+
+
 class Steps(Protocol):
     """The functions of a stepper."""
 
     time_step: float
+    forces: Mapping[str, str]
 
     @property
     def name(self) -> str: ...
     def step(self, x: Array, u: Array, tau: Array, p: Names, dt: float) -> Array: ...
     def sensed(self, x: Array, u: Array, p: Names) -> Mapping[str, Array]: ...
+    def single(self) -> SingleStep | None: ...
 
 
 class StepperEvaluation(CachedEvaluation):
@@ -109,6 +115,28 @@ class StepperEvaluation(CachedEvaluation):
             if constants is not None:
                 found[rows] = self._at(outputs, states[rows], given[rows, :first], Names(**named, **constants))
         return found
+
+    def single(self) -> Callable[[Sequence[float], Sequence[float], Sequence[float]], Sequence[float]] | None:
+        """A function from states, inputs and parameters to the rates at a point; None without fast single steps."""
+        step = self.stepper.single()
+        if step is None:
+            return None
+        first, m = len(self.inputs) + len(self.stepper.forces), len(self.inputs)
+        h, failed = self.stepper.time_step, [np.nan] * len(self.states)
+        known: dict[tuple[float, ...], Names | None] = {}
+
+        def rates(states: Sequence[float], inputs: Sequence[float], parameters: Sequence[float]) -> Sequence[float]:
+            changes = (*inputs[first:], *parameters)
+            if changes not in known:
+                constants = self.changed(np.asarray(inputs[first:]))
+                named = dict(zip(self.parameters, parameters, strict=True))
+                known[changes] = None if constants is None else Names(**named, **constants)
+            p = known[changes]
+            if p is None:
+                return failed
+            return [(b - a) / h for a, b in zip(states, step(states, inputs[:m], inputs[m:first], p), strict=True)]
+
+        return rates
 
     def slopes(self, outputs: bool, at: EvaluationPoints, group: Group) -> Array:
         """Derivatives by each variable of a group, (S, k, size of the group); as in :meth:`slope`."""

@@ -23,7 +23,7 @@ from mkc_torch.simulation.dynamics.steps import Steps
 from mkc_torch.simulation.foreign.function import evaluated
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.parameter import Parameter, SimulationError, known_parameters
-from mkc_torch.simulation.stepped.evaluation import StepperEvaluation
+from mkc_torch.simulation.stepped.evaluation import SingleStep, StepperEvaluation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -130,6 +130,13 @@ class Stepper(Dynamics):
             x = self.step(x[None], u[[k]], tau[[k]], p, dt)[0]
             found[k] = x
         return found
+
+    def single(self) -> SingleStep | None:
+        """Return a function for single steps in sequence that is much faster than ``step``; default: None.
+
+        It has the states, the inputs, the forces, and the parameters and constants, and returns the next states.
+        """
+        return None
 
     @property
     def steps(self) -> Steps:  # type: ignore[override]

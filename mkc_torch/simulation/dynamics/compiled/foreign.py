@@ -22,12 +22,17 @@ if TYPE_CHECKING:
     """Points as rows, and the shape of the stations or samples that they are."""
 
 
+Single = Callable[[Sequence[float], Sequence[float], Sequence[float]], Sequence[float]]
+"""The rates at a point, from its states, inputs and parameters."""
+
+
 class ForeignFunction(Protocol):
-    """Values and derivatives of a function outside torch at S points, (S, k) each."""
+    """Values and derivatives of a function outside torch at S points, (S, k) each; its rates at a point, if fast."""
 
     def count(self, outputs: bool) -> int: ...
     def values(self, outputs: bool, at: EvaluationPoints) -> Array: ...
     def slope(self, outputs: bool, at: EvaluationPoints, group: Group, number: int) -> Array: ...
+    def single(self) -> Single | None: ...
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from mkc_torch.simulation.dynamics.compiled.affine import multiplied
 from mkc_torch.simulation.dynamics.compiled.arrays import ArraySystem
 from mkc_torch.simulation.dynamics.compiled.collocation import ArrayGrid, Collocation, Factor, ParameterSources, marched
 from mkc_torch.simulation.dynamics.compiled.expressions import Array
+from mkc_torch.simulation.dynamics.compiled.in_sequence import in_sequence
 from mkc_torch.simulation.dynamics.compiled.machine import MachineSystem, machine_system
 from mkc_torch.simulation.dynamics.compiled.traced import Traceable, Traced, traced
 from mkc_torch.simulation.dynamics.observer import CLIP
@@ -72,9 +73,15 @@ class CompiledDynamics:
         return Answer(torch.from_numpy(np.ascontiguousarray(residual.T)), nearby)
 
     def _stepped(self, parameters: Tensor) -> tuple[Array, Factor | None] | None:
-        """The states of a simulation that steps by its own steps; None where effects add to them, or they fail."""
+        """The states of a simulation that steps by its own steps; None where these are slow, or fail."""
         theta, changes = self._meaning(parameters)
-        found = self._plain_steps(theta, changes) if rolls_out(self._system, theta, changes) else None
+        if rolls_out(self._system, theta, changes):
+            found = self._plain_steps(theta, changes)
+        elif self._grid.maps and self._observed is None:
+            values = parameters.tolist()
+            found = in_sequence(self._traced, self._grid, values, self._first(values))
+        else:
+            return None
         return None if found is None else (found, None)
 
     def _solved(self, parameters: Tensor, known: Trajectory | None) -> tuple[Array, Factor | None] | None:

@@ -45,6 +45,7 @@ class Tape:
         self._parameters: list[tuple[int, int]] = []
         self._courses: list[tuple[int, Course]] = []
         self._states: list[tuple[int, int]] = []
+        self._nodes = needed
         steps: tuple[list[_Step], ...] = ([], [], [])
         for node, k in place.items():
             own = expressions.nodes[node]
@@ -66,14 +67,29 @@ class Tape:
         self._arranged = arranged
         self._by_parameters, self._by_states = steps[PARAMETER], steps[STATE]
 
-    def at(self, parameters: Sequence[float]) -> Evaluation:
-        """The output nodes as a function of the states, at these parameters."""
+    @property
+    def steps(self) -> list[tuple[Callable[..., Any], int, tuple[int, ...], int]]:
+        """What depends on the states, in sequence: function, place of the value, places of the arguments, node."""
+        return [(function, k, arguments, self._nodes[k]) for function, k, arguments in self._by_states]
+
+    @property
+    def states(self) -> list[tuple[int, int]]:
+        """Place and index of each state."""
+        return self._states
+
+    def values_at(self, parameters: Sequence[float]) -> list[Any]:
+        """The values that do not depend on the states, at their places; None elsewhere."""
         slots = list(self._fixed)
         for k, index in self._parameters:
             slots[k] = parameters[index]
         for k, course in self._courses:
             slots[k] = self._arranged(course.at(parameters))
         _run(self._by_parameters, slots)
+        return slots
+
+    def at(self, parameters: Sequence[float]) -> Evaluation:
+        """The output nodes as a function of the states, at these parameters."""
+        slots = self.values_at(parameters)
 
         def evaluated(states: Array) -> list[Any]:
             own = list(slots)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,8 @@ import numpy as np
 from mujoco import rollout
 
 from mkc_torch._parallel.processes import cores
+from mkc_torch.simulation.names import Names
+from mkc_torch.simulation.stepped.evaluation import SingleStep
 from mkc_torch.simulation.stepped.mujoco.description import Description
 
 if TYPE_CHECKING:
@@ -23,7 +25,10 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
 
 _STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
+_MOTION = mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL | mujoco.mjtState.mjSTATE_ACT
 _CONTROL = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED
+
+_GIVEN = _MOTION | mujoco.mjtState.mjSTATE_WARMSTART | _CONTROL
 
 _HEAVY = 1e4
 """Inertia of a joint that is followed, as a multiple of the largest of the model; far larger ones slow MuJoCo down."""
@@ -72,30 +77,41 @@ class Engine:
             parameters: value by name.
         """
         if self._layout.followed:
-            return self._rolled_along(x, u, tau, parameters)
+            found, step, named = np.empty((len(u), len(x))), self.single(), Names(**parameters)
+            state: Sequence[float] = x.tolist()
+            for k, (inputs, forces) in enumerate(zip(u.tolist(), tau.tolist(), strict=True)):
+                state = step(state, inputs, forces, named)
+                found[k] = state
+            found[np.maximum.accumulate(~_usable(found))] = np.nan
+            return found
         usable = (_usable(x) & _usable(u).all() & _usable(tau).all())[None]
         return self._advanced(x[None], self._layout.control(u, tau)[None], usable, parameters)[0][0]
 
-    def _rolled_along(self, x: Array, u: Array, tau: Array, parameters: Mapping[str, float]) -> Array:
-        """The states (T, n), where the joints that are followed are set before each step."""
-        self._set(parameters)
+    def single(self) -> SingleStep:
+        """A function for single steps in sequence."""
         layout, model, data = self._layout, self.model, mujoco.MjData(self.model)
-        first, joints, controls = layout.states(x[None], u[:1])[0], layout.joints, model.nu
-        data.qpos[:], data.qvel[:], data.act[:] = np.split(first, [joints, 2 * joints])
-        given, control, followed = layout.states(np.zeros((len(u), len(x))), u), layout.control(u, tau), layout.followed
-        places, speeds = given[:, followed], given[:, [joints + joint for joint in followed]]
-        found = np.empty((len(u), len(first)))
-        for k in range(len(u)):
-            data.qpos[followed], data.qvel[followed] = places[k], speeds[k]
-            data.ctrl[:], data.qfrc_applied[:], data.qacc_warmstart[:] = (
-                control[k, :controls],
-                control[k, controls:],
-                0.0,
-            )
+        n, controls, row = layout.states_in_all, len(layout.controls), np.zeros(mujoco.mj_stateSize(model, _GIVEN))
+        own, first = layout.own.tolist(), n + layout.joints
+        drives = [first + place for place in (*layout.controls, *layout.forces)]
+        moved = [*layout.followed, *(layout.joints + k for k in layout.followed)]
+        forced = [first + layout.controls_in_all - layout.joints + k for k in layout.followed]
+        after, heavy = np.empty(n), layout.heavy
+        set_up: list[Names] = []
+
+        def step(x: Sequence[float], u: Sequence[float], tau: Sequence[float], p: Names) -> Sequence[float]:
+            if not set_up or set_up[0] is not p:
+                self._set(vars(p))
+                set_up[:] = [p]
+            row[own], row[drives] = x, (*u[:controls], *tau)
+            if moved:
+                row[moved] = (*u[controls::3], *u[controls + 1 :: 3])
+                row[forced] = [heavy * acceleration for acceleration in u[controls + 2 :: 3]]
+            mujoco.mj_setState(model, data, row, _GIVEN)
             mujoco.mj_step(model, data)
-            found[k, :joints], found[k, joints : 2 * joints], found[k, 2 * joints :] = data.qpos, data.qvel, data.act
-        found[np.maximum.accumulate(~_usable(found))] = np.nan
-        return found[:, layout.own]
+            mujoco.mj_getState(model, data, after, _MOTION)
+            return after[own].tolist()
+
+        return step
 
     def _advanced(self, x: Array, control: Array, usable: Mask, parameters: Mapping[str, float]) -> tuple[Array, Array]:
         """All states (B, T, n) and ``sensordata`` (B, T, s) over T steps with all controls (B, T, c)."""

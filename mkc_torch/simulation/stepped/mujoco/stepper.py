@@ -16,6 +16,7 @@ from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.foreign.model_file import model_file
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.parameter import SimulationError
+from mkc_torch.simulation.stepped.evaluation import SingleStep
 from mkc_torch.simulation.stepped.mujoco.description import Description, described
 from mkc_torch.simulation.stepped.mujoco.following import with_followed, with_moving
 from mkc_torch.simulation.stepped.stepper import Stepper
@@ -45,6 +46,10 @@ class MujocoStepper(Stepper):
 
     def rollout(self, x: Array, u: Array, tau: Array, p: Names, dt: float) -> Array:
         return self._engine.rolled_out(x, u, tau, vars(p))
+
+    def single(self) -> SingleStep:
+        found: SingleStep = self._engine.single()
+        return found
 
     def sensed(self, x: Array, u: Array, p: Names) -> Mapping[str, Array]:
         shown = self._engine.stepped(x, u, np.zeros((len(x), len(self.forces))), vars(p))[1]
