@@ -22,6 +22,7 @@ from mkc_torch.cli.console import (
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request, is_file_of_a_simulation
 from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.cli.recorded import read_magnetometer, read_table, refuse_no_magnetometer
+from mkc_torch.cli.simulation_option import ALL, EACH
 from mkc_torch.cli.steps import Steps
 from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.diagnosis.io.python_source import SourceError
@@ -330,7 +331,8 @@ def simulation_of(request: Request) -> Simulation:
     if request.simulator_output is not None:
         return paired_simulation(request.simulator_output, request.columns)
     found = named_simulation(request.simulation, request.fit)
-    return found.moving(request.joints) if request.joints and isinstance(found, MujocoStepper) else found
+    named = request.joints not in ((), (ALL,), (EACH,))
+    return found.moving(request.joints) if named and isinstance(found, MujocoStepper) else found
 
 
 def _renamed(recording: Recording, name: str) -> Recording:

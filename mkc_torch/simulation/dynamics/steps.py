@@ -23,6 +23,7 @@ class Steps:
         followed: inputs that are recorded motion; effects do not act on them, and they are linear between samples.
         rollout: from a state (1, n), inputs (T, u) and the parameters to the states after each of T steps, (T, n),
             without derivatives.
+        alone: whether the derivative is that of the steps and nothing else, so that such a rollout is the trajectory.
     """
 
     size: float
@@ -31,6 +32,7 @@ class Steps:
     constants: tuple[str, ...]
     followed: tuple[str, ...]
     rollout: Callable[[Tensor, Tensor, Any], Tensor]
+    alone: bool
 
 
 def port_of(steps: Steps | None, name: str) -> str:

@@ -140,9 +140,9 @@ class Stepper(Dynamics):
 
     @property
     def steps(self) -> Steps:  # type: ignore[override]
-        return Steps(
-            self.time_step, self.positions, self.forces, tuple(self.constants), self.followed, self._rolled_out
-        )
+        alone = type(self).derivative is Stepper.derivative  # a corrected class adds to it
+        constants = tuple(self.constants)
+        return Steps(self.time_step, self.positions, self.forces, constants, self.followed, self._rolled_out, alone)
 
     @property
     def columns(self) -> frozenset[str]:

@@ -144,7 +144,7 @@ def test_a_finding_that_mjcf_cannot_express_is_named_in_the_file(two_links):
     sizes = [torch.tensor([0.08]), torch.tensor([1.0])]
     system = load_mjcf(two_links)
     theta = [parameter.value for parameter in system.parameters.values()]
-    text, others = mjcf_source(system, theta, terms, sizes)
+    text, others = mjcf_source([(system, theta, terms, sizes)])
     assert 'frictionloss="0.08"' in text
     assert len(others) == 1
     assert "shoulder_ctrl" in others[0]

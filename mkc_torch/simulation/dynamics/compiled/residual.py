@@ -75,7 +75,8 @@ class CompiledDynamics:
     def _stepped(self, parameters: Tensor) -> tuple[Array, Factor | None] | None:
         """The states of a simulation that steps by its own steps; None where these are slow, or fail."""
         theta, changes = self._meaning(parameters)
-        if rolls_out(self._system, theta, changes):
+        steps = self._system.system.steps
+        if steps is not None and steps.alone and rolls_out(self._system, theta, changes):
             found = self._plain_steps(theta, changes)
         elif self._grid.maps and self._observed is None:
             values = parameters.tolist()
