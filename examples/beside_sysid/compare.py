@@ -1,0 +1,110 @@
+"""Compare a fit of numbers alone with a diagnosis: ``python -m examples.beside_sysid.compare --output DIR``.
+
+For each recording, `mujoco.sysid` fits the damping of both joints, and `mkc diagnose` fits the same numbers and looks
+for missing physics. Both models then predict a second recording with other commands, from its first sample.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+
+from examples.beside_sysid.recordings import ARM, HIDDEN, NUMBERS, Hidden, recorded
+from mkc_torch.diagnosis import diagnose
+from mkc_torch.diagnosis.io.model import DiagnosedModel
+from mkc_torch.diagnosis.parts import Finding
+from mkc_torch.diagnosis.validation.predict import predict
+from mkc_torch.recording import Recording
+from mkc_torch.simulation import load_mjcf
+
+SAMPLES = 400
+
+
+def compared(hidden: Hidden, fitted: dict[str, float], samples: int = SAMPLES, seed: int = 1) -> dict[str, Any]:
+    """Return what both fits found, and the error of each model on a second recording.
+
+    Args:
+        hidden: what the recordings have more.
+        fitted: the numbers by `mujoco.sysid`.
+        samples: of each recording.
+        seed: of the first recording.
+    """
+    first, second = (as_recording(recorded(hidden, samples, number)) for number in (seed, seed + 1))
+    with TemporaryDirectory() as folder:
+        (Path(folder) / "arm.xml").write_text(ARM, encoding="utf-8")
+        arm = load_mjcf(Path(folder) / "arm.xml")
+        diagnosis = diagnose(arm, first, quick=True)
+        model = diagnosis.model
+        assert isinstance(model, DiagnosedModel)
+        ours = dict(zip(arm.parameters, model.theta.tolist(), strict=False))
+        findings = [_in_words(finding) for finding in diagnosis.findings]
+        models = {"file": _plain(arm, NUMBERS), "sysid": _plain(arm, fitted), "mkc": model}
+        errors = {name: _rmse(predict(known, second).residual) for name, known in models.items()}
+    return {
+        "hidden": hidden.name,
+        "numbers": {"sysid": fitted, "mkc": ours},
+        "findings": findings,
+        "error": errors,
+    }
+
+
+def as_recording(columns: dict[str, Any]) -> Recording:
+    return Recording({name: torch.from_numpy(np.asarray(values)) for name, values in columns.items()})
+
+
+def _plain(arm: Any, numbers: Mapping[str, float]) -> DiagnosedModel:
+    """The model with these numbers and no findings."""
+    values = torch.tensor([numbers[name] for name in arm.parameters], dtype=torch.float64)
+    return DiagnosedModel(arm.name, {"input_hold": {}}, values, (), (), arm)
+
+
+def _in_words(finding: Finding) -> str:
+    first = finding.parameters[0]
+    value = float(torch.as_tensor(first.value).flatten()[0])
+    return f"{finding.effect} at {', '.join(finding.channels)}: {first.name} {value:.3g} {first.unit}".strip()
+
+
+def _rmse(residual: torch.Tensor) -> float:
+    return float(residual.detach().square().mean().sqrt())
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """The comparison as a table in Markdown; errors in rad."""
+    lines = [
+        "| hidden | damping by sysid | damping by mkc | found | error of the file | after sysid | after mkc |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        numbers = [", ".join(f"{value:.3f}" for value in row["numbers"][by].values()) for by in ("sysid", "mkc")]
+        errors = [f"{row['error'][by]:.4f}" for by in ("file", "sysid", "mkc")]
+        lines.append(
+            f"| {row['hidden']} | {' | '.join(numbers)} | {'; '.join(row['findings'])} | {' | '.join(errors)} |"
+        )
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--output", type=Path, required=True, help="folder for rows.json and table.md")
+    given = parser.parse_args(arguments)
+    from examples.beside_sysid.numbers_alone import fitted_numbers
+
+    given.output.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for hidden in HIDDEN:
+        rows.append(compared(hidden, fitted_numbers(recorded(hidden, SAMPLES, 1))))
+        print(f"{hidden.name}: {rows[-1]['error']}", flush=True)
+        (given.output / "rows.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    (given.output / "table.md").write_text(table(rows) + "\n", encoding="utf-8")
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()

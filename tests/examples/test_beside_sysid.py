@@ -1,0 +1,54 @@
+"""The recordings and the table of the comparison with a fit of numbers alone."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+
+from examples.beside_sysid.compare import _plain, as_recording, table
+from examples.beside_sysid.recordings import ARM, HIDDEN, NOISE, NUMBERS, recorded
+from mkc_torch.diagnosis.validation.predict import predict
+from mkc_torch.simulation import load_mjcf
+
+
+@pytest.fixture
+def arm(tmp_path):
+    (tmp_path / "arm.xml").write_text(ARM)
+    return load_mjcf(tmp_path / "arm.xml")
+
+
+def errors(arm, hidden, numbers=NUMBERS):
+    """Error of each joint of the model without findings."""
+    return predict(_plain(arm, numbers), as_recording(recorded(hidden, 150, 3))).residual.square().mean(0).sqrt()
+
+
+def test_without_missing_physics_the_model_predicts_the_recording(arm):
+    assert float(errors(arm, HIDDEN[0]).max()) < 6 * NOISE  # its step is five times that of the recording
+
+
+@pytest.mark.parametrize("hidden", HIDDEN[1:], ids=lambda hidden: hidden.name)
+def test_missing_physics_is_far_above_the_noise(arm, hidden):
+    assert float(errors(arm, hidden).max()) > 15 * NOISE
+
+
+def test_a_fit_of_numbers_alone_finds_them_where_nothing_is_missing_and_bends_them_elsewhere():
+    pytest.importorskip("absl")
+    from examples.beside_sysid.numbers_alone import fitted_numbers
+
+    right, bent = (fitted_numbers(recorded(hidden, 100, 1)) for hidden in HIDDEN[:2])
+    assert right == pytest.approx(NUMBERS, rel=0.05)
+    assert bent["elbow_damping"] > 1.2 * NUMBERS["elbow_damping"]
+
+
+def test_the_table_has_a_row_for_each_recording():
+    row = {
+        "hidden": "nothing",
+        "numbers": {"sysid": {"a": 0.3, "b": 0.21}, "mkc": {"a": 0.302, "b": 0.2}},
+        "findings": ["coulomb_friction at elbow_force: friction 0.12 N m"],
+        "error": {"file": np.float64(0.05), "sysid": 0.04, "mkc": 0.001},
+    }
+    lines = table([row, row]).splitlines()
+    assert len(lines) == 4
+    assert lines[2].count("|") == lines[0].count("|")
+    assert "0.300, 0.210" in lines[2]
+    assert "friction 0.12 N m | 0.0500 | 0.0400 | 0.0010" in lines[2]
