@@ -1,4 +1,4 @@
-"""Compare a fit of numbers alone with a diagnosis: ``python -m examples.beside_sysid.compare --output DIR``.
+"""Compare a fit of numbers alone with a diagnosis: ``python -m examples.numbers_alone.compare --output DIR``.
 
 For each recording, `mujoco.sysid` fits the damping of both joints, and `mkc diagnose` fits the same numbers and looks
 for missing physics. Both models then predict a second recording with other commands, from its first sample.
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from examples.beside_sysid.recordings import ARM, HIDDEN, NUMBERS, Hidden, recorded
+from examples.numbers_alone.recordings import ARM, HIDDEN, NUMBERS, Hidden, recorded
 from mkc_torch.diagnosis import diagnose
 from mkc_torch.diagnosis.io.model import DiagnosedModel
 from mkc_torch.diagnosis.parts import Finding
@@ -94,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, required=True, help="folder for rows.json and table.md")
     given = parser.parse_args(arguments)
-    from examples.beside_sysid.numbers_alone import fitted_numbers
+    from examples.numbers_alone.least_squares import fitted_numbers
 
     given.output.mkdir(parents=True, exist_ok=True)
     rows = []

@@ -5,8 +5,8 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from examples.beside_sysid.compare import _plain, as_recording, table
-from examples.beside_sysid.recordings import ARM, HIDDEN, NOISE, NUMBERS, recorded
+from examples.numbers_alone.compare import _plain, as_recording, table
+from examples.numbers_alone.recordings import ARM, HIDDEN, NOISE, NUMBERS, recorded
 from mkc_torch.diagnosis.validation.predict import predict
 from mkc_torch.simulation import load_mjcf
 
@@ -33,7 +33,7 @@ def test_missing_physics_is_far_above_the_noise(arm, hidden):
 
 def test_a_fit_of_numbers_alone_finds_them_where_nothing_is_missing_and_bends_them_elsewhere():
     pytest.importorskip("absl")
-    from examples.beside_sysid.numbers_alone import fitted_numbers
+    from examples.numbers_alone.least_squares import fitted_numbers
 
     right, bent = (fitted_numbers(recorded(hidden, 100, 1)) for hidden in HIDDEN[:2])
     assert right == pytest.approx(NUMBERS, rel=0.05)

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from mujoco import sysid
 
-from examples.beside_sysid.recordings import ARM, JOINTS, MOTORS, NUMBERS, SAMPLE, Array
+from examples.numbers_alone.recordings import ARM, JOINTS, MOTORS, NUMBERS, SAMPLE, Array
 
 
 def _set_damping(spec: Any, parameter: Any, joint: str) -> None:

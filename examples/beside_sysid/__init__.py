@@ -1,1 +1,0 @@
-"""The diagnosis of a MuJoCo model beside a fit of its numbers alone, by `mujoco.sysid`."""
