@@ -45,7 +45,7 @@ def compared(hidden: Hidden, fitted: dict[str, float], samples: int = SAMPLES, s
         assert isinstance(model, DiagnosedModel)
         ours = dict(zip(arm.parameters, model.theta.tolist(), strict=False))
         findings = [_in_words(finding) for finding in diagnosis.findings]
-        models = {"file": _plain(arm, NUMBERS), "sysid": _plain(arm, fitted), "mkc": model}
+        models = {"file": without_findings(arm, NUMBERS), "sysid": without_findings(arm, fitted), "mkc": model}
         errors = {name: _rmse(predict(known, second).residual) for name, known in models.items()}
     return {
         "hidden": hidden.name,
@@ -59,7 +59,7 @@ def as_recording(columns: dict[str, Any]) -> Recording:
     return Recording({name: torch.from_numpy(np.asarray(values)) for name, values in columns.items()})
 
 
-def _plain(arm: Any, numbers: Mapping[str, float]) -> DiagnosedModel:
+def without_findings(arm: Any, numbers: Mapping[str, float]) -> DiagnosedModel:
     """The model with these numbers and no findings."""
     values = torch.tensor([numbers[name] for name in arm.parameters], dtype=torch.float64)
     return DiagnosedModel(arm.name, {"input_hold": {}}, values, (), (), arm)

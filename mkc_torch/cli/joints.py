@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mkc_torch._support.files import write_atomically
+from mkc_torch.cli.console import FAILURES
 from mkc_torch.cli.diagnosis_files import read_recording, simulation_of
 from mkc_torch.cli.diagnosis_request import Request, is_model_of_mujoco
 from mkc_torch.cli.simulation_option import ALL, EACH, MOST_TOGETHER
@@ -24,7 +25,7 @@ def by_joints(path: Path, request: Request) -> list[Request]:
     whole = replace(request, joints=())
     try:
         recording, simulation = read_recording(path, whole), simulation_of(whole)
-    except Exception:
+    except FAILURES:
         return [whole]
     joints = list(getattr(simulation, "positions", ()))
     measured = [name for name in joints if name in recording]

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from examples.numbers_alone.compare import _plain, as_recording, table
+from examples.numbers_alone.compare import as_recording, table, without_findings
 from examples.numbers_alone.recordings import ARM, HIDDEN, NOISE, NUMBERS, recorded
 from mkc_torch.diagnosis.validation.predict import predict
 from mkc_torch.simulation import load_mjcf
@@ -19,7 +19,9 @@ def arm(tmp_path):
 
 def errors(arm, hidden, numbers=NUMBERS):
     """Error of each joint of the model without findings."""
-    return predict(_plain(arm, numbers), as_recording(recorded(hidden, 150, 3))).residual.square().mean(0).sqrt()
+    return (
+        predict(without_findings(arm, numbers), as_recording(recorded(hidden, 150, 3))).residual.square().mean(0).sqrt()
+    )
 
 
 def test_without_missing_physics_the_model_predicts_the_recording(arm):
