@@ -74,6 +74,7 @@ TESTED = {
     "examples/concealed_physics/dynamics/baselines.py": "test_dynamics_baselines.py",
     "examples/concealed_physics/real.py": "test_known_physics.py",
     "examples/concealed_physics/histone/petab_select_0009.py": "test_petab_select.py",
+    "examples/numbers_alone/compare.py": "test_numbers_alone.py",
 }
 """Scripts that tests/examples runs at a small size: here only their options are checked."""
 
