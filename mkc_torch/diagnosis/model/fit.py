@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from mkc_torch import nonlinear
 from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.density.fit import fit_density
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.noise.outliers import pseudo_residual
@@ -72,6 +74,7 @@ class FittedModel:
         residual, weights: (N, m).
         log_likelihood: in nats, of all samples and channels.
         converged: whether the iteration has converged.
+        squares: whether it is of least squares: σ is held at infinity.
     """
 
     model: JointModel
@@ -83,6 +86,7 @@ class FittedModel:
     weights: Float[Tensor, "N m"]
     log_likelihood: float
     converged: bool
+    squares: bool = False
 
     def pseudo(self, settings: NoiseSettings) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
         """Return the pseudo-residual and its mask, (N, m) each."""
@@ -91,6 +95,11 @@ class FittedModel:
             return values, counts
         recorded = self.recorded.to(counts.dtype)
         return values * recorded, counts * recorded
+
+    def rejected_share(self, settings: NoiseSettings) -> float:
+        """Share of the recorded samples that the fit rejects."""
+        _, counts = self.pseudo(settings)
+        return 1.0 - float(counts.sum()) / max(counts.numel() if self.recorded is None else int(self.recorded.sum()), 1)
 
     @property
     def recorded(self) -> Bool[Tensor, "N m"] | None:
@@ -134,6 +143,7 @@ def fitted(
     graduate: bool = True,
     fresh: bool = False,
     effort: Effort = FULL,
+    squares: bool = False,
 ) -> FittedModel:
     """Fit a joint model by maximum likelihood.
 
@@ -146,17 +156,19 @@ def fitted(
         fresh: True to also search for a trajectory without the model's own as the start, if there is none near that:
             it may belong to another noise model. This is slow.
         effort: how far the fit goes.
+        squares: True for least squares.
 
     Raises:
         NoFitError: the simulation has no finite result at the start or at the end of the fit.
     """
-    found = _fit(*_finite_start(model, start, fresh=fresh), bound, rows, graduate=graduate, effort=effort)
+    begun = _finite_start(model, start, fresh=fresh)
+    found = _fit(*begun, bound, rows, graduate=graduate, effort=effort, squares=squares)
     for _ in range(effort.restarts):
         seen = found.residual if rows is None else found.residual[rows > 0]
         if not bool((found.d > _WIDE * robust_scale(seen)).any()):
             break
         # a scale that fits the initial residuals can remain a local optimum
-        again = _fit(found.model, found.parameters, found.bound, rows, graduate=False)
+        again = _fit(found.model, found.parameters, found.bound, rows, graduate=False, squares=squares)
         if not again.log_likelihood > found.log_likelihood:
             break
         found = again
@@ -171,6 +183,7 @@ def _fit(
     *,
     graduate: bool,
     effort: Effort = FULL,
+    squares: bool = False,
 ) -> FittedModel:
     way, recorded = model.continuation(), model.prepared.recorded
     weight = rows if recorded is None else recorded_weight(recorded, rows).to(start)
@@ -178,6 +191,7 @@ def _fit(
         way,
         start,
         bound=bound,
+        sigma=math.inf if squares else None,
         weight=weight,
         prior=model.prior,
         lower=None if model.bounds is None else model.bounds[0],
@@ -202,6 +216,7 @@ def _fit(
         found.weights,
         _total_log_likelihood(found, residual, weight if recorded is not None else None),
         bool(found.converged),
+        squares,
     )
 
 
@@ -214,12 +229,55 @@ def _total_log_likelihood(
     return -float((weight * mkc_nll(residual, found.sigma, found.d, found.bound)).sum())
 
 
+def by_least_squares(fit: FittedModel, effort: Effort = FULL) -> FittedModel | None:
+    """Return the fit of least squares from a fit's parameters; None if it fails.
+
+    A robust fit takes a stretch that the model does not follow for outliers, and follows a quiet rest of the recording
+    all the more closely.
+    """
+    try:
+        return fitted(fit.model, fit.parameters, graduate=False, effort=effort, squares=True)
+    except nonlinear.NoFitError:
+        return None
+
+
+def with_own_density(fit: FittedModel, model: JointModel | None = None) -> FittedModel | None:
+    """Return a fit at the same parameters with the σ and d of its residual, on a domain that holds it.
+
+    Args:
+        fit: its parameters are kept.
+        model: another model of the same parameters; None for the fit's own.
+
+    Returns:
+        None if the model has no finite residual there.
+    """
+    model = fit.model if model is None else model
+    residual = model.residual(fit.parameters).detach()
+    if not bool(residual.isfinite().all()):
+        return None
+    recorded = None if fit.recorded is None else fit.recorded.to(residual)
+    bound = torch.maximum(fit.bound, _DOMAIN_SCALES * robust_scale(residual))
+    density = fit_density(residual, bound=bound, weight=recorded)
+    samples = len(residual) if recorded is None else recorded.sum(0)
+    return replace(
+        fit,
+        model=model,
+        sigma=density.sigma,
+        d=density.d,
+        bound=bound,
+        residual=residual,
+        weights=torch.exp(-0.5 * (residual / (density.d * density.sigma)).square()),
+        log_likelihood=float((density.log_likelihood * samples).sum()),
+        squares=False,
+    )
+
+
 def fitted_with_effect(
     base: FittedModel, model: JointModel, start: Float[Tensor, " p"], *, graduate: bool = True, effort: Effort = FULL
 ) -> FittedModel:
     """Fit a model with one more effect on the domain of a fit without it; return the latter if this fails."""
     try:
-        return fitted(model, start, base.bound, graduate=graduate, effort=effort)
+        return fitted(model, start, base.bound, graduate=graduate, effort=effort, squares=base.squares)
     except nonlinear.NoFitError:
         none = base.parameters.new_zeros(model.size - base.model.size)
         return replace(base, model=model, parameters=torch.cat([base.parameters, none]))

@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
-from mkc_torch.density import fit_density
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted, no_first_fit
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted, no_first_fit, with_own_density
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.settings import NoiseSettings
@@ -260,21 +259,7 @@ def with_noise_around(fit: FittedModel, declared: Mapping[str, float], settings:
     if noise is None or noise.observer is None:
         return fit
     model = JointModel(fit.model.prepared.observed(noise.observer), fit.model.terms, fit.model.near)
-    residual = model.residual(fit.parameters).detach()
-    if not bool(residual.isfinite().all()):
-        return fit
-    recorded = None if fit.recorded is None else fit.recorded.to(residual)
-    density = fit_density(residual, bound=fit.bound, weight=recorded)
-    samples = len(residual) if recorded is None else recorded.sum(0)
-    return replace(
-        fit,
-        model=model,
-        sigma=density.sigma,
-        d=density.d,
-        residual=residual,
-        weights=torch.exp(-0.5 * (residual / (density.d * density.sigma)).square()),
-        log_likelihood=float((density.log_likelihood * samples).sum()),
-    )
+    return with_own_density(fit, model) or fit
 
 
 def refit_open_loop(fit: FittedModel) -> FittedModel | None:

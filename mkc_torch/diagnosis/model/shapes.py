@@ -323,7 +323,8 @@ def shape_fitted(fit: FittedModel, effort: Effort = FULL) -> FittedModel:
     if model.size == model.joint:
         return fit
     try:
-        both = fitted(model, model.start(fit.parameters), fit.bound, graduate=False, effort=effort)
+        start = model.start(fit.parameters)
+        both = fitted(model, start, fit.bound, graduate=False, effort=effort, squares=fit.squares)
     except NoFitError:
         return fit
     if not both.log_likelihood > fit.log_likelihood:
@@ -425,6 +426,6 @@ def _with_terms(fit: FittedModel, terms: Sequence[Term], effort: Effort = FULL) 
     """Refit with other shapes of the effects; None if there is no finite trajectory."""
     model = JointModel(fit.model.prepared, terms, fit.model.near)
     try:
-        return fitted(model, fit.parameters, fit.bound, graduate=False, effort=effort)
+        return fitted(model, fit.parameters, fit.bound, graduate=False, effort=effort, squares=fit.squares)
     except NoFitError:
         return None

@@ -6,31 +6,29 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import zip_longest
 
 import torch
 
 from mkc_torch._parallel.progress import report_bound, report_found
-from mkc_torch.diagnosis.model.fit import SEARCH, FittedModel, fitted, fitted_with_effect
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise, has_process_noise
 from mkc_torch.diagnosis.model.shapes import candidate_terms, shape_fitted, with_profiled_shape
 from mkc_torch.diagnosis.model.suspect import suspect_id
-from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
+from mkc_torch.diagnosis.model.term import Term, run_parallel
 from mkc_torch.diagnosis.score import Score, ScoreBasis, is_implausible, score, separation
 from mkc_torch.diagnosis.search.along_noise import TRIED, add_along_noise
 from mkc_torch.diagnosis.search.candidate import Candidate, ModelKey, in_order, model_key, place_of, predicts_better
 from mkc_torch.diagnosis.search.in_words import leading
 from mkc_torch.diagnosis.search.move_fits import (
-    POLISHED,
-    at_other_values,
-    fits_at_own_holds,
     fitted_exchanged,
     fitted_held,
     fitted_in_form,
     fitted_reordered,
     fitted_simpler,
-    fitted_through_noise,
     fitted_with,
     fitted_without,
+    other_starts,
 )
 from mkc_torch.diagnosis.search.moves import (
     Addition,
@@ -203,10 +201,10 @@ class BeamSearch:
         fit, have = model.fit, len(model.fit.model.terms)
         works: list[tuple[ModelKey, str, Callable[[], FittedModel | None]]] = []
         if have < self.most_terms and not any(term.effect.is_curve for term in fit.model.terms):
-            others = self._other_starts(fit, terms, further) if not have else {}
-            for addition in self._chosen(additions(fit, terms, self.settings.noise), model, rank, further):
+            others = other_starts(fit, terms, further, self.noisy, self.fixed, self.settings) if not have else {}
+            for base, addition in self._proposed(model, rank, terms, further):
                 key = model_key([*fit.model.terms, addition.starts[0][0]])
-                work = partial(self.distinct, fit, addition, others.get(addition.key, ()))
+                work = partial(self.distinct, base, addition, () if base.squares else others.get(addition.key, ()))
                 works.append((key, f"add {self.id_of(addition.starts[0][0])}", work))
         for number, term in enumerate(fit.model.terms):
             if have > 1:
@@ -250,8 +248,9 @@ class BeamSearch:
         """Expand the models near the best, and exchange the best's effects for others of the same channels."""
         best, most = None, self.most_models - (2 * TRIED if self.most_models > 10 * TRIED else 0)
         while self.best.fit.model.terms and len(self.models) < most:
-            near = self.best.value - self.settings.naming.separable * self.basis.kappa
-            waiting = [model for model in self.beam() if model.value >= near and model.key not in expanded]
+            lead, least = self.best.score, self.settings.naming.separable
+            near = [model for model in self.beam() if separation(lead, model.score, self.basis) <= least]
+            waiting = [model for model in near if model.key not in expanded]
             if waiting:
                 expanded.add(waiting[0].key)
                 self._expand(waiting[0], 0, terms, further, most)
@@ -278,33 +277,6 @@ class BeamSearch:
                 works.append((key, move, partial(self.distinct, rest.fit, addition)))
         self._fit(works, fit, most)
 
-    def _other_starts(
-        self, fit: FittedModel, terms: Sequence[Term], further: Sequence[Term]
-    ) -> dict[Key, list[Callable[[], FittedModel | None]]]:
-        """Return fits of each effect from elsewhere than the simulation alone in open loop.
-
-        From its initial values, if the fit went far from them or to values that cannot be; and through the process
-        noise of the simulation alone, along whose trajectory a strong effect can be fitted that the open loop does not
-        reach. The latter is slow, and is for the candidates that the screening found there. A delay also starts from
-        the simulation's own holds.
-        """
-        found: dict[Key, list[Callable[[], FittedModel | None]]] = {}
-        noisy = self.noisy
-        for there in at_other_values(fit, self.settings.search.ran_away):
-            for addition in additions(there, terms, self.settings.noise):
-                for term, size in addition.starts[:POLISHED]:
-                    start = torch.cat([there.parameters, size])
-                    work = partial(fitted_with_effect, fit, fit.model.with_term(term), start, effort=SEARCH)
-                    found.setdefault(addition.key, []).append(work)
-        for key, held in fits_at_own_holds(fit, terms, self.fixed, self.settings.noise):
-            found.setdefault(key, []).append(held)
-        if noisy is not None:
-            leading = {term.key for term in further}
-            led = [term for term in terms if term.key in leading and not term.effect.open_loop_only]
-            for addition in additions(noisy, led, self.settings.noise):
-                found.setdefault(addition.key, []).append(partial(fitted_through_noise, noisy, *addition.starts[0]))
-        return found
-
     def with_one_less(self, model: Candidate) -> list[Candidate]:
         """Return the models without one of a model's effects, fitted if they are not known."""
         fit = model.fit
@@ -315,6 +287,21 @@ class BeamSearch:
         works = [(key, f"drop {self.id_of(term)}", partial(fitted_without, fit, number)) for key, number, term in rests]
         self._fit(works, fit, len(self.models) + len(works))
         return [self.models[key] for key, _, _ in rests if key in self.models]
+
+    def _proposed(
+        self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term]
+    ) -> list[tuple[FittedModel, Addition]]:
+        """Return the additions to fit with the fit to add them to: in turn to the model's own and to least squares."""
+        fits = [model.fit, by_squares(model.fit, self.settings.noise)]
+        chosen = [
+            [
+                (fit, addition)
+                for addition in self._chosen(additions(fit, terms, self.settings.noise), model, rank, further)
+            ]
+            for fit in fits
+            if fit is not None
+        ]
+        return [pair for pairs in zip_longest(*chosen) for pair in pairs if pair is not None]
 
     def _chosen(
         self, found: Sequence[Addition], model: Candidate, rank: int, further: Sequence[Term]
@@ -359,11 +346,13 @@ class BeamSearch:
         self, works: Sequence[tuple[ModelKey, str, Callable[[], FittedModel | None]]], near: FittedModel, most: int
     ) -> None:
         """Fit and score models that are not known yet, in parallel, up to a number of models in all."""
-        new: dict[ModelKey, tuple[str, Callable[[], FittedModel | None]]] = {}
+        new: dict[ModelKey, tuple[str, list[Callable[[], FittedModel | None]]]] = {}
         for key, move, work in works:
-            if key not in self.models and len(self.models) + len(new) < most:
-                new.setdefault(key, (move, work))
-        tried = [partial(self.scored, move, work) for move, work in new.values()]
+            if key in new:
+                new[key][1].append(work)
+            elif key not in self.models and len(self.models) + len(new) < most:
+                new[key] = (move, [work])
+        tried = [partial(self.scored, move, *several) for move, several in new.values()]
         if self._running:
             report_bound("model", len(self.models), self.most_models)
         found = run_parallel(tried, near.model.prepared, self.terms, "model")
@@ -385,10 +374,15 @@ class BeamSearch:
         """Whether the recording separates a fit from another that scores lower."""
         return self.value_of(other) > self.value_of(fit) + self.settings.naming.separable * self.basis.kappa
 
-    def scored(self, move: str, work: Callable[[], FittedModel | None]) -> Candidate | None:
+    def scored(self, move: str, *works: Callable[[], FittedModel | None]) -> Candidate | None:
+        """Return the fit of a model that scores highest, of several fits and of least squares from these."""
         self._scores.clear()
-        fit = work()
-        return None if fit is None else Candidate(fit, self.score_of(fit), move)
+        fits = [fit for work in works if (fit := work()) is not None]
+        fits = [other for fit in fits for other in by_both_estimators(fit, self.settings.noise)]
+        if not fits:
+            return None
+        best = max(fits, key=self.value_of)
+        return Candidate(best, self.score_of(best), move)
 
     def keep(self, models: Iterable[Candidate]) -> None:
         for model in models:

@@ -12,19 +12,23 @@ from mkc_torch.diagnosis.model.fit import (
     ROUGH,
     SEARCH,
     FittedModel,
+    by_least_squares,
     clipped_residual,
     fitted,
     fitted_with_effect,
+    with_own_density,
     without_term,
 )
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.process_noise import has_process_noise
 from mkc_torch.diagnosis.model.shapes import Better, shape_fitted, with_form_of_grid
 from mkc_torch.diagnosis.model.simpler import simpler_start
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.search.moves import Addition, additions, at_size_zero
-from mkc_torch.diagnosis.settings import NoiseSettings
+from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.impossible import impossible_values
+from mkc_torch.simulation.dynamics.kalman import OUTLIERS
 
 POLISHED = 2
 """Rough fits of an effect that are refined to the end."""
@@ -106,10 +110,61 @@ def fits_at_own_holds(
             yield addition.key, partial(fitted_with_effect, held, held.model.with_term(term), start, effort=SEARCH)
 
 
+def by_squares(fit: FittedModel, settings: NoiseSettings) -> FittedModel | None:
+    """Return the fit of least squares, if the robust fit rejects more samples than the score takes for outliers.
+
+    A robust fit takes a stretch that the model does not follow for outliers: what is missing there then shows in no
+    linear gain, and the parameters follow the quiet rest.
+    """
+    if fit.squares or has_process_noise(fit) or fit.rejected_share(settings) <= OUTLIERS:
+        return None
+    return by_least_squares(fit, SEARCH)
+
+
+def by_both_estimators(fit: FittedModel, settings: NoiseSettings) -> Iterator[FittedModel]:
+    """Yield a model's robust fit, and that of least squares with the density of its residual, where they may differ."""
+    squares = fit if fit.squares else by_squares(fit, settings)
+    own = None if squares is None else with_own_density(squares)
+    robust = fit if not fit.squares else None if own is None else _refitted(own, own)
+    yield from (found for found in (robust, own) if found is not None)
+
+
 def fitted_through_noise(noisy: FittedModel, term: Term, size: torch.Tensor) -> FittedModel | None:
     """Return the open-loop fit with an effect from its fit under process noise."""
     start = torch.cat([noisy.parameters, size])
     return fitted_with_effect(noisy, noisy.model.with_term(term), start, graduate=False, effort=SEARCH).open_loop
+
+
+def other_starts(
+    fit: FittedModel,
+    terms: Sequence[Term],
+    further: Sequence[Term],
+    noisy: FittedModel | None,
+    fixed: Mapping[str, str],
+    settings: Settings,
+) -> dict[Key, list[Callable[[], FittedModel | None]]]:
+    """Return fits of each effect from elsewhere than the simulation alone in open loop.
+
+    From its initial values, if the fit went far from them or to values that cannot be; and through the process
+    noise of the simulation alone, along whose trajectory a strong effect can be fitted that the open loop does not
+    reach. The latter is slow, and is for the candidates that the screening found there. A delay also starts from
+    the simulation's own holds.
+    """
+    found: dict[Key, list[Callable[[], FittedModel | None]]] = {}
+    for there in at_other_values(fit, settings.search.ran_away):
+        for addition in additions(there, terms, settings.noise):
+            for term, size in addition.starts[:POLISHED]:
+                start = torch.cat([there.parameters, size])
+                work = partial(fitted_with_effect, fit, fit.model.with_term(term), start, effort=SEARCH)
+                found.setdefault(addition.key, []).append(work)
+    for key, held in fits_at_own_holds(fit, terms, fixed, settings.noise):
+        found.setdefault(key, []).append(held)
+    if noisy is not None:
+        leading = {term.key for term in further}
+        led = [term for term in terms if term.key in leading and not term.effect.open_loop_only]
+        for addition in additions(noisy, led, settings.noise):
+            found.setdefault(addition.key, []).append(partial(fitted_through_noise, noisy, *addition.starts[0]))
+    return found
 
 
 def fitted_with(
@@ -181,7 +236,7 @@ def fitted_exchanged(
 
 def _refitted(start: FittedModel, like: FittedModel) -> FittedModel | None:
     try:
-        return fitted(start.model, start.parameters, like.bound, graduate=False, effort=SEARCH)
+        return fitted(start.model, start.parameters, like.bound, graduate=False, effort=SEARCH, squares=like.squares)
     except NoFitError:
         return None
 
