@@ -21,6 +21,8 @@ from mkc_torch.diagnosis.search.along_noise import TRIED, add_along_noise
 from mkc_torch.diagnosis.search.candidate import Candidate, ModelKey, in_order, model_key, place_of, predicts_better
 from mkc_torch.diagnosis.search.in_words import leading
 from mkc_torch.diagnosis.search.move_fits import (
+    by_both_estimators,
+    by_squares,
     fitted_exchanged,
     fitted_held,
     fitted_in_form,
