@@ -74,7 +74,7 @@ class FittedModel:
         residual, weights: (N, m).
         log_likelihood: in nats, of all samples and channels.
         converged: whether the iteration has converged.
-        squares: whether it is of least squares: σ is held at infinity.
+        squares: whether its open loop is of least squares, because a robust one would follow less of the recording.
     """
 
     model: JointModel
@@ -102,6 +102,11 @@ class FittedModel:
         return 1.0 - float(counts.sum()) / max(counts.numel() if self.recorded is None else int(self.recorded.sum()), 1)
 
     @property
+    def sigma_held(self) -> bool:
+        """Whether σ is held at infinity: further fits from here are of least squares."""
+        return self.squares and bool(self.sigma.isinf().all())
+
+    @property
     def recorded(self) -> Bool[Tensor, "N m"] | None:
         """Mask of the recorded outputs; None where none is missing."""
         return self.model.prepared.recorded
@@ -110,12 +115,15 @@ class FittedModel:
     def open_loop(self) -> FittedModel | None:
         """The fit of the same joint model in open loop, for several stages; None if that loses the recording.
 
-        The more likely of a fit from these parameters and of one with a graduated start.
+        The more likely of a fit from these parameters and of one with a graduated start, or that of least squares.
         """
         prepared = self.model.prepared.open_loop()
         if prepared is self.model.prepared:
             return self
         model = JointModel(prepared, self.model.terms, self.model.near)
+        if self.squares:
+            squares = by_least_squares(replace(self, model=model))
+            return None if squares is None else with_own_density(squares)
         both = run_parallel(
             [partial(_tried, model, self, graduate) for graduate in (False, True)], prepared, model.terms
         )
@@ -241,6 +249,27 @@ def by_least_squares(fit: FittedModel, effort: Effort = FULL) -> FittedModel | N
         return None
 
 
+def fitted_like(
+    model: JointModel, start: Float[Tensor, " p"], like: FittedModel, *, graduate: bool = False
+) -> FittedModel:
+    """Fit a model by the estimator of another fit of the recording, on its domain.
+
+    Args:
+        model: the joint model.
+        start: its parameters to start from.
+        like: the other fit.
+        graduate: False for a start near the solution.
+
+    Raises:
+        NoFitError: the simulation has no finite result at the start or at the end of the fit.
+    """
+    found = fitted(model, start, like.bound, graduate=graduate, squares=like.squares)
+    own = with_own_density(found) if like.squares else found
+    if own is None:
+        raise nonlinear.NoFitError("The simulation has no finite trajectory at the end of the fit.")
+    return own
+
+
 def with_own_density(fit: FittedModel, model: JointModel | None = None) -> FittedModel | None:
     """Return a fit at the same parameters with the σ and d of its residual, on a domain that holds it.
 
@@ -268,7 +297,6 @@ def with_own_density(fit: FittedModel, model: JointModel | None = None) -> Fitte
         residual=residual,
         weights=torch.exp(-0.5 * (residual / (density.d * density.sigma)).square()),
         log_likelihood=float((density.log_likelihood * samples).sum()),
-        squares=False,
     )
 
 
@@ -277,7 +305,7 @@ def fitted_with_effect(
 ) -> FittedModel:
     """Fit a model with one more effect on the domain of a fit without it; return the latter if this fails."""
     try:
-        return fitted(model, start, base.bound, graduate=graduate, effort=effort, squares=base.squares)
+        return fitted(model, start, base.bound, graduate=graduate, effort=effort, squares=base.sigma_held)
     except nonlinear.NoFitError:
         none = base.parameters.new_zeros(model.size - base.model.size)
         return replace(base, model=model, parameters=torch.cat([base.parameters, none]))

@@ -324,7 +324,7 @@ def shape_fitted(fit: FittedModel, effort: Effort = FULL) -> FittedModel:
         return fit
     try:
         start = model.start(fit.parameters)
-        both = fitted(model, start, fit.bound, graduate=False, effort=effort, squares=fit.squares)
+        both = fitted(model, start, fit.bound, graduate=False, effort=effort, squares=fit.sigma_held)
     except NoFitError:
         return fit
     if not both.log_likelihood > fit.log_likelihood:
@@ -426,6 +426,6 @@ def _with_terms(fit: FittedModel, terms: Sequence[Term], effort: Effort = FULL) 
     """Refit with other shapes of the effects; None if there is no finite trajectory."""
     model = JointModel(fit.model.prepared, terms, fit.model.near)
     try:
-        return fitted(model, fit.parameters, fit.bound, graduate=False, effort=effort, squares=fit.squares)
+        return fitted(model, fit.parameters, fit.bound, graduate=False, effort=effort, squares=fit.sigma_held)
     except NoFitError:
         return None

@@ -10,7 +10,7 @@ from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.diagnosis.evidence.base import EvidenceContext
 from mkc_torch.diagnosis.evidence.held_out import Evidence, held_out, on_all
 from mkc_torch.diagnosis.evidence.prediction import sizes_of
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted, without_term
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted, fitted_like, without_term
 from mkc_torch.diagnosis.optional import optional
 from mkc_torch.diagnosis.parts import Finding, HeldOutScore, OutputSize
 from mkc_torch.diagnosis.vetoes import counts
@@ -95,7 +95,7 @@ def counted_fit(final: FittedModel, alone: FittedModel, kept: Collection[int]) -
 def _refitted(start: FittedModel, final: FittedModel) -> FittedModel:
     """Fit a model with fewer effects; from a start that is beyond the domain of the final fit in two steps."""
     try:
-        return fitted(start.model, start.parameters, final.bound, graduate=False)
+        return fitted_like(start.model, start.parameters, final)
     except NoFitError:
         residual = start.model.residual(start.parameters).detach()
         near = fitted(start.model, start.parameters, final.bound.maximum(_WIDE * robust_scale(residual)))

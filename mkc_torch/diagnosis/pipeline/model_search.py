@@ -12,7 +12,7 @@ import torch
 from mkc_torch.diagnosis.environment import GoodnessOfFit
 from mkc_torch.diagnosis.evidence.held_out import Evidence, blocks_of, gain_interval, held_out, on_all
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, poor_fits, size_of
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted_like
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.process_noise import (
     ProcessNoiseFit,
@@ -281,7 +281,8 @@ def with_step_of(search: StepwiseSearch, base: ProcessNoiseFit, options: SearchO
         # an effect may have chosen another hold of an input than the simulation alone
         holds = located.fit.model.prepared.input_hold
         model = JointModel(prepared.with_input_hold(holds), located.fit.model.terms)
-        fit = shape_fitted(fitted(model, located.fit.parameters, located.fit.bound))
+        fit = fitted_like(model, located.fit.parameters, located.fit, graduate=True)
+        fit = fit if fit.squares else shape_fitted(fit)
         if has_process_noise(located.fit):
             fit = fit_with_process_noise(fit, options.declared, options.settings.noise).fit
         found.append(replace(located, fit=fit, term=fit.model.terms[-1]))

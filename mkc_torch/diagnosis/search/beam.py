@@ -206,7 +206,7 @@ class BeamSearch:
             others = other_starts(fit, terms, further, self.noisy, self.fixed, self.settings) if not have else {}
             for base, addition in self._proposed(model, rank, terms, further):
                 key = model_key([*fit.model.terms, addition.starts[0][0]])
-                work = partial(self.distinct, base, addition, () if base.squares else others.get(addition.key, ()))
+                work = partial(self.distinct, base, addition, () if base.sigma_held else others.get(addition.key, ()))
                 works.append((key, f"add {self.id_of(addition.starts[0][0])}", work))
         for number, term in enumerate(fit.model.terms):
             if have > 1:
@@ -294,7 +294,7 @@ class BeamSearch:
         self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term]
     ) -> list[tuple[FittedModel, Addition]]:
         """Return the additions to fit with the fit to add them to: in turn to the model's own and to least squares."""
-        fits = [model.fit, by_squares(model.fit, self.settings.noise)]
+        fits = [replace(model.fit, squares=False), by_squares(model.fit, self.settings.noise)]
         chosen = [
             [
                 (fit, addition)
@@ -406,7 +406,7 @@ class BeamSearch:
             noisy = shape_fitted(fit_with_process_noise(model.fit, self.declared, self.settings.noise).fit)
         except NoFitError:
             return model
-        return self._better(model, noisy, less)
+        return self._better(model, replace(noisy, squares=model.fit.squares), less)
 
     def with_best_hold(self, model: Candidate) -> Candidate:
         """Return a model with the hold of each input that scores highest; the simulation's own within ``HOLD``."""
@@ -441,5 +441,7 @@ class BeamSearch:
     def _better(self, model: Candidate, fit: FittedModel, less: float = 0.0) -> Candidate:
         if fit is model.fit:
             return model
-        other = replace(model, fit=fit, score=score(fit, self.basis, self.settings))
-        return other if other.value > model.value - less else model
+        fits = by_both_estimators(fit, self.settings.noise)
+        others = [replace(model, fit=each, score=score(each, self.basis, self.settings)) for each in fits]
+        best = max(others, key=lambda other: other.value, default=model)
+        return best if best.value > model.value - less else model

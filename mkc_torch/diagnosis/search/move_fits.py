@@ -116,17 +116,17 @@ def by_squares(fit: FittedModel, settings: NoiseSettings) -> FittedModel | None:
     A robust fit takes a stretch that the model does not follow for outliers: what is missing there then shows in no
     linear gain, and the parameters follow the quiet rest.
     """
-    if fit.squares or has_process_noise(fit) or fit.rejected_share(settings) <= OUTLIERS:
+    if has_process_noise(fit) or (not fit.squares and fit.rejected_share(settings) <= OUTLIERS):
         return None
     return by_least_squares(fit, SEARCH)
 
 
 def by_both_estimators(fit: FittedModel, settings: NoiseSettings) -> Iterator[FittedModel]:
     """Yield a model's robust fit, and that of least squares with the density of its residual, where they may differ."""
-    squares = fit if fit.squares else by_squares(fit, settings)
+    squares = fit if fit.sigma_held else by_squares(fit, settings)
     own = None if squares is None else with_own_density(squares)
-    robust = fit if not fit.squares else None if own is None else _refitted(own, own)
-    yield from (found for found in (robust, own) if found is not None)
+    robust = fit if own is None or not fit.squares else _refitted(replace(own, squares=False), own)
+    yield from (found for found in (robust, own) if found is not None and not found.sigma_held)
 
 
 def fitted_through_noise(noisy: FittedModel, term: Term, size: torch.Tensor) -> FittedModel | None:
@@ -236,7 +236,7 @@ def fitted_exchanged(
 
 def _refitted(start: FittedModel, like: FittedModel) -> FittedModel | None:
     try:
-        return fitted(start.model, start.parameters, like.bound, graduate=False, effort=SEARCH, squares=like.squares)
+        return fitted(start.model, start.parameters, like.bound, graduate=False, effort=SEARCH, squares=like.sigma_held)
     except NoFitError:
         return None
 
