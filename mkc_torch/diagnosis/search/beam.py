@@ -250,9 +250,8 @@ class BeamSearch:
         """Expand the models near the best, and exchange the best's effects for others of the same channels."""
         best, most = None, self.most_models - (2 * TRIED if self.most_models > 10 * TRIED else 0)
         while self.best.fit.model.terms and len(self.models) < most:
-            lead, least = self.best.score, self.settings.naming.separable
-            near = [model for model in self.beam() if separation(lead, model.score, self.basis) <= least]
-            waiting = [model for model in near if model.key not in expanded]
+            near = self.best.value - self.settings.naming.separable * self.basis.kappa
+            waiting = [model for model in self.beam() if model.value >= near and model.key not in expanded]
             if waiting:
                 expanded.add(waiting[0].key)
                 self._expand(waiting[0], 0, terms, further, most)
