@@ -231,7 +231,8 @@ def test_the_command_counts_writes_and_compares(tmp_path, monkeypatch, capsys):
 
 
 def test_draws_are_scored_by_their_keys(tmp_path):
-    (family, _) = drawn.both_proofs(tmp_path, match="proof magnetometer", sizes={"magnetometer": 1, "dynamics": 0})
+    sizes = {"magnetometer": 1, "dynamics": 0, "mujoco": 0}
+    (family, *_) = drawn.all_proofs(tmp_path, match="proof magnetometer", sizes=sizes)
     hidden, empty = (next(job.name for job in family.jobs if kind in job.name) for kind in ("hidden", "empty"))
     truth = family.truths[hidden]["hidden"][0]
     claim = finding(truth["effect"], at=[]) | {"drivers": truth["drivers"]}
@@ -241,7 +242,7 @@ def test_draws_are_scored_by_their_keys(tmp_path):
     rows = {hidden: row(verdict="adequate"), empty: row(verdict="adequate")}
     assert family.outcomes(rows) == {hidden: {"named": False}, empty: {"false_alarm": False}}
     assert all(job.recording.is_file() for job in family.jobs)
-    again = next(iter(drawn.both_proofs(tmp_path / "again", match="hidden", sizes={"magnetometer": 1, "dynamics": 0})))
+    again = next(iter(drawn.all_proofs(tmp_path / "again", match="hidden", sizes=sizes)))
     assert again.truths[hidden] == family.truths[hidden]
 
 
@@ -257,7 +258,7 @@ def test_scenarios_are_scored_by_their_keys(tmp_path):
 
 
 def test_undecidable_single_runs_are_counted_apart(tmp_path):
-    (family, _) = drawn.all_scenarios(tmp_path, match="scenario dynamics lasting_push empty", empty=2, hidden=0)
+    (family, *_) = drawn.all_scenarios(tmp_path, match="scenario dynamics lasting_push empty", empty=2, hidden=0)
     assert len(family.jobs) == 2
     rival = finding("backlash", alternatives=("dead_zone",))
     rows = {job.name: row(item) for job, item in zip(family.jobs, (finding("backlash"), rival), strict=True)}

@@ -5,6 +5,7 @@ hash of the key is written before the first diagnosis; it proves that the key di
 
     magnetometer            recordings of a magnetometer, and a second recording of each sensor
     equations               the same for six systems of differential equations and a servo
+    mujoco                  the same for five robots, stepped by MuJoCo with elements that the user's file lacks
     magnetometer_scenarios  scenarios of noise, drift and unusable recordings, each with its own score
     equations_scenarios     scenarios of noise, process noise, inputs and wrong simulations, each with its own score
 
@@ -35,9 +36,19 @@ from mkc_torch._parallel.pool import allow_copies
 from mkc_torch._parallel.processes import cores, keep_memory, one_thread
 from mkc_torch.cli.console import FAILURES, complain, out, progress
 
+
+def _mujoco(_: float) -> Proof:
+    try:
+        from examples.blind_proof.mujoco.cases import mujoco_steps
+    except ModuleNotFoundError as error:
+        raise ValueError(f"{error}; the proof of robots needs MuJoCo: pip install mujoco") from None
+    return mujoco_steps()
+
+
 KINDS: Mapping[str, Callable[[float], Proof]] = {
     "magnetometer": magnetometer,
     "equations": lambda _: equations(),
+    "mujoco": _mujoco,
     "magnetometer_scenarios": magnetometer_scenarios,
     "equations_scenarios": lambda _: equations_scenarios(),
 }

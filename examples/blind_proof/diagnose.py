@@ -49,7 +49,13 @@ def corrected_columns(model: Path, simulation: Simulation | None, recording: Rec
 
 
 def request_for(recording: Path, simulation: Path) -> Request:
-    """Return the request of a user with this simulation file, or with a magnetometer if there is no such file."""
+    """Return the request of a user with this simulation file, or with a magnetometer if there is no such file.
+
+    A model of MuJoCo has the same name with the suffix ``.xml``.
+    """
+    model = simulation.with_suffix(".xml")
+    if model.is_file():
+        return Request(simulation=str(model), force=True, report=False)
     named = f"{simulation}:{simulation_name(recording)}" if simulation.is_file() else MAGNETOMETER
     return Request(simulation=named, force=True, report=False)
 

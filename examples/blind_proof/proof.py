@@ -30,7 +30,7 @@ class Case:
         recording: the recording.
         key: its key.
         second: another recording of the same sensor with the same effect; None without hidden physics.
-        simulation: Python source that is given to the diagnosis; "" for the simulation of a magnetometer.
+        simulation: Python source or a model of MuJoCo that is given to the diagnosis; "" for a magnetometer.
     """
 
     recording: Recording

@@ -156,13 +156,23 @@ def write_case(output: Path, case: Case) -> None:
     """Write the recordings of a case and its simulation, in place of those of an earlier run."""
     name = case.key.name
     write_table(output / "recordings" / f"{name}.csv", case.recording.columns, overwrite=True)
-    second, simulation = output / "second" / f"{name}.csv", output / SIMULATIONS / f"{name}.py"
-    for old in (second, simulation):
+    second, files = output / "second" / f"{name}.csv", output / SIMULATIONS
+    for old in (second, files / f"{name}.py", files / f"{name}.xml"):
         old.unlink(missing_ok=True)
     if case.second is not None:
         write_table(second, case.second.columns)
     if case.simulation:
-        write_atomically(simulation, case.simulation)
+        write_atomically(files / f"{name}{suffix_of(case.simulation)}", case.simulation)
+
+
+def suffix_of(simulation: str) -> str:
+    """Return the suffix of a simulation's file, a model of MuJoCo or Python.
+
+    Example:
+        >>> suffix_of("<mujoco/>"), suffix_of("import torch")
+        ('.xml', '.py')
+    """
+    return ".xml" if simulation.lstrip().startswith("<") else ".py"
 
 
 def diagnose_batch(diagnose: Diagnose, folder: Path, paths: list[Path]) -> None:

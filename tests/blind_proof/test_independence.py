@@ -16,7 +16,10 @@ USER_SIMULATIONS = FOLDER / "equations" / "models.py"
 DIAGNOSIS_RUNNERS = {FOLDER / "__main__.py", FOLDER / "diagnose.py"}
 """The files that run the code under test."""
 
-ALLOWED = {"examples", "mkc_torch", "torch", "numpy", "jaxtyping", "jinja2", "markupsafe", "matplotlib", "__future__"}
+ALLOWED = {
+    *("examples", "mkc_torch", "torch", "numpy", "jaxtyping", "jinja2", "markupsafe", "matplotlib", "__future__"),
+    "mujoco",
+}
 
 
 def imported_modules(path):

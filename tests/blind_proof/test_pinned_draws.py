@@ -6,9 +6,11 @@ from examples.blind_proof.equations.cases import equations
 from examples.blind_proof.equations.scenarios import equations_scenarios
 from examples.blind_proof.magnetometer.cases import magnetometer
 from examples.blind_proof.magnetometer.scenarios import magnetometer_scenarios
+from examples.blind_proof.mujoco.cases import mujoco_steps
 
 PROOFS = {
-    proof.name: proof for proof in (magnetometer(), equations(), magnetometer_scenarios(30.0), equations_scenarios())
+    proof.name: proof
+    for proof in (magnetometer(), equations(), mujoco_steps(), magnetometer_scenarios(30.0), equations_scenarios())
 }
 
 PINNED = (
@@ -24,6 +26,10 @@ PINNED = (
      "input_lag", 117.630297),
     ("equations", "equations", 7, 1, True, 1, {"command": 66.8283, "angle": 88.472789},
      "gravity_sag", 65.986509),
+    ("mujoco", "mujoco", 7, 0, False, 0, {"first": 74.08063, "elbow": -97.862972},
+     "", 0.0),
+    ("mujoco", "mujoco", 7, 1, True, 1, {"motor": -14.98779, "hinge": 0.839453},
+     "input_lag", 525.443859),
     ("magnetometer_scenarios", "white", 7, 0, False, 10, {"mag_x": 11441.0341, "mag_y": 44393.4303},
      "", 0.0),
     ("magnetometer_scenarios", "bursts", 7, 1, True, 11, {"mag_x": -6184.0041, "mag_y": 23632.564},

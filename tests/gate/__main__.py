@@ -87,7 +87,7 @@ def run(
     if "scenarios" in parts:
         draws["scenarios"] = list(drawn.all_scenarios(output, match=match, workers=workers))
     if "proofs" in parts:
-        draws["proofs"] = list(drawn.both_proofs(output, match=match, workers=workers))
+        draws["proofs"] = list(drawn.all_proofs(output, match=match, workers=workers))
     jobs += [job for group in draws.values() for draw in group for job in draw.jobs]
     rows: dict[str, dict[str, Any]] = {}
     if resume and (output / RESULT).is_file():

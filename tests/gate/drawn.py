@@ -14,8 +14,9 @@ from examples.blind_proof.equations.scenarios import equations_scenarios
 from examples.blind_proof.key import Key
 from examples.blind_proof.magnetometer.cases import magnetometer
 from examples.blind_proof.magnetometer.scenarios import magnetometer_scenarios
+from examples.blind_proof.mujoco.cases import mujoco_steps
 from examples.blind_proof.proof import Case, Proof
-from examples.blind_proof.run import Pool, every
+from examples.blind_proof.run import Pool, every, suffix_of
 from examples.blind_proof.score import ProofScore, Score, score_proof
 from examples.blind_proof.scored_case import ScoredCase, scored
 from mkc_torch._support.files import write_atomically
@@ -27,7 +28,7 @@ SEED = 7
 EMPTY_PER_SCENARIO = 6
 HIDDEN_PER_SCENARIO = 2
 
-PER_PROOF = {"magnetometer": 40, "dynamics": 20}
+PER_PROOF = {"magnetometer": 40, "dynamics": 20, "mujoco": 5}
 """Recordings with a hidden effect in each proof; as many again have none."""
 
 Rows = Mapping[str, Mapping[str, Any]]
@@ -80,11 +81,11 @@ def all_scenarios(
         yield _of_scenarios(proof, *_written(addresses, output / "drawn" / f"scenarios_{family}", workers))
 
 
-def both_proofs(
+def all_proofs(
     output: Path, *, match: str = "", workers: int = 1, sizes: Mapping[str, int] = PER_PROOF
 ) -> Iterator[Drawn]:
-    """Draw both proofs; only recordings whose name contains ``match``."""
-    for family, proof in (("magnetometer", magnetometer()), ("dynamics", equations())):
+    """Draw the proofs; only recordings whose name contains ``match``."""
+    for family, proof in (("magnetometer", magnetometer()), ("dynamics", equations()), ("mujoco", mujoco_steps())):
         (scenario,), size = proof.scenarios, sizes[family]
         addresses = [
             _Address(name, partial(scenario.draw, SEED, index, index < size, index))
@@ -106,7 +107,7 @@ def _write(folder: Path, address: _Address) -> tuple[Job, Key]:
     case = address.draw()
     recording = folder / f"{case.key.name}.csv"
     write_table(recording, case.recording.columns, overwrite=True)
-    simulation = recording.with_suffix(".py")
+    simulation = recording.with_suffix(suffix_of(case.simulation))
     if case.simulation:
         write_atomically(simulation, case.simulation, overwrite=True)
     return Job(address.name, recording, request_for(recording, simulation)), case.key
