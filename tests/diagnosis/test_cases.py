@@ -212,6 +212,7 @@ def diagnosed_real(recording, simulation, begin=0, end=None, step=1):
     return diagnose(load_simulation(f"{shared_real(file)}:{name}"), part)
 
 
+@pytest.mark.slow
 @pytest.mark.e2e
 def test_a_coasting_rocket_has_quadratic_drag():
     diagnosis = diagnosed_real("rocket/juno.csv", "rocket/naive.py:Rocket")
@@ -222,6 +223,7 @@ def test_a_coasting_rocket_has_quadratic_drag():
     assert value(found, "drag") == pytest.approx(9.2e-5, rel=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.e2e
 def test_the_size_of_drag_belongs_to_a_gravity_within_its_bounds():
     # the air thins with height, so gravity ends at its lower bound; without it the drag would be 1.2e-4 1/m
@@ -236,6 +238,7 @@ def test_dry_friction_replaces_a_power_law_at_its_bound():
     assert value(found, "friction") == pytest.approx(0.206, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.e2e
 def test_a_mug_loses_heat_by_a_high_power():
     diagnosis = diagnosed_real("mug/run.csv", "mug/naive.py:Cooling")

@@ -96,6 +96,7 @@ def test_a_slow_thermometer_is_a_sensor_lag():
     assert finding.held_out.rmse_after == pytest.approx(0.1, rel=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.e2e
 def test_a_drivers_dead_zone_acts_before_the_motors_lag():
     diagnosis = diagnose(Motor(), motor(), **QUICK)

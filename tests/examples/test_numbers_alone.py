@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 
 pytest.importorskip("mujoco")
+pytest.importorskip("matplotlib")
 
-from examples.numbers_alone.compare import as_recording, table, without_findings
+from matplotlib import pyplot as plt
+from matplotlib.colors import to_rgb
+
+from examples.numbers_alone.compare import as_recording, draw, table, without_findings
 from examples.numbers_alone.recordings import ARM, HIDDEN, NOISE, NUMBERS, recorded
 from mkc_torch.diagnosis.validation.predict import predict
 from mkc_torch.simulation import load_mjcf
@@ -40,6 +44,17 @@ def test_a_fit_of_numbers_alone_finds_them_where_nothing_is_missing_and_bends_th
     right, bent = (fitted_numbers(recorded(hidden, 100, 1)) for hidden in HIDDEN[:2])
     assert right == pytest.approx(NUMBERS, rel=0.05)
     assert bent["elbow_damping"] > 1.2 * NUMBERS["elbow_damping"]
+
+
+def test_the_picture_has_a_line_for_each_model(arm, tmp_path):
+    second = as_recording(recorded(HIDDEN[1], 60, 2))
+    right = predict(without_findings(arm, NUMBERS), second).residual.detach()
+    draw(tmp_path / "picture.png", HIDDEN[1], second, {"file": right, "sysid": 0.5 * right, "mkc": 0.1 * right})
+    height, width, _ = plt.imread(tmp_path / "picture.png").shape
+    assert (width, height) == (880, 495)
+    shown = plt.imread(tmp_path / "picture.png")[height // 2 :, :, :3]
+    for color in ("tab:gray", "tab:orange", "tab:blue"):
+        assert (np.abs(shown - to_rgb(color)).max(-1) < 0.02).sum() > 100, color
 
 
 def test_the_table_has_a_row_for_each_recording():
