@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from tests.gate.each_joint_effect import HIDDEN, NOISE_RAD, SAMPLES, judged, recorded
-
 pytest.importorskip("mujoco")
+
+from tests.gate.each_joint_effect import HIDDEN, NOISE_RAD, SAMPLES, judged, recorded
 
 
 @pytest.mark.parametrize("kind", HIDDEN)

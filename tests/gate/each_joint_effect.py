@@ -19,25 +19,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from examples.blind_proof.mujoco import elements
+from examples.blind_proof.mujoco.elements import Element
+from examples.blind_proof.mujoco.robots import ROBOTS
 from mkc_torch.recording.recording import write_table
 
-ARM = """
-<mujoco model="arm">
-  <compiler angle="radian"/>
-  <option timestep="0.005" integrator="implicitfast"/>
-  <worldbody>
-    <body name="upper" pos="0 0 1">
-      <joint name="shoulder" type="hinge" axis="0 1 0" damping="0.2"/>
-      <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="1" contype="0" conaffinity="0"/>
-      <body name="fore" pos="0 0 -0.4">
-        <joint name="elbow" type="hinge" axis="0 1 0" damping="0.1"/>
-        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.5" contype="0" conaffinity="0"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator><motor name="first" joint="shoulder"/><motor name="second" joint="elbow"/></actuator>
-</mujoco>
-"""
+ARM = ROBOTS["arm"].xml
 """The arm as its file has it."""
 
 FINER = 5
@@ -66,65 +53,24 @@ class Hidden:
     write: Callable[[Any, float], None]
 
 
-def _friction(spec: Any, size: float) -> None:
-    spec.joint("elbow").frictionloss = size
-
-
-def _stop(spec: Any, size: float) -> None:
-    import mujoco
-
-    spec.joint("elbow").limited = mujoco.mjtLimited.mjLIMITED_TRUE
-    spec.joint("elbow").range = [-size, 10.0]
-
-
-def _lag(spec: Any, size: float) -> None:
-    import mujoco
-
-    spec.actuator("second").dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
-    spec.actuator("second").dynprm[0] = size
-
-
-def _limit(spec: Any, size: float) -> None:
-    import mujoco
-
-    spec.actuator("first").ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
-    spec.actuator("first").ctrlrange = [-size, size]
-
-
-def _load(spec: Any, size: float) -> None:
-    import mujoco
-
-    load = spec.body("fore").add_geom()
-    load.type, load.size, load.mass = mujoco.mjtGeom.mjGEOM_SPHERE, [0.001, 0.0, 0.0], size
-    load.pos, load.contype, load.conaffinity = [0.0, 0.0, -0.15], 0, 0
-
-
 def _length(spec: Any, size: float) -> None:
     spec.body("fore").pos = [0.0, 0.0, -0.4 - size]
 
 
-def _tilt(spec: Any, size: float) -> None:
-    spec.option.gravity = [9.81 * np.sin(size), 0.0, -9.81 * np.cos(size)]
-
-
-def _zero(spec: Any, size: float) -> None:
-    spec.joint("elbow").ref = size
-
-
-def _inertia(spec: Any, size: float) -> None:
-    spec.joint("elbow").armature = size
+def _hidden(element: Element, parameter: str = "change") -> Hidden:
+    return Hidden(element.effect, element.at[0], element.sizes, parameter, element.write)
 
 
 HIDDEN: Mapping[str, Hidden] = {
-    "friction": Hidden("coulomb_friction", "input elbow_force", (0.03, 0.08), "friction", _friction),
-    "stop": Hidden("hard_stop", "input elbow_force", (0.3, 0.5), "", _stop),
-    "lag": Hidden("input_lag", "input second", (0.03, 0.08), "lag", _lag),
-    "limit": Hidden("input_saturation", "input first", (1.2, 1.8), "limit", _limit),
-    "load": Hidden("constant_change", "constant fore_mass", (0.05, 0.15), "change", _load),
+    "friction": _hidden(elements.friction("elbow", (0.03, 0.08)), "friction"),
+    "stop": _hidden(elements.stop("elbow", (0.3, 0.5)), ""),
+    "lag": _hidden(elements.lag("second", (0.03, 0.08)), "lag"),
+    "limit": _hidden(elements.limit("first", (1.2, 1.8)), "limit"),
+    "load": _hidden(elements.payload("fore", (0.0, 0.0, -0.15), (0.05, 0.15))),
     "length": Hidden("constant_change", "constant fore_distance", (0.02, 0.06), "change", _length),
-    "tilt": Hidden("constant_change", "constant base_tilt_x", (0.03, 0.1), "change", _tilt),
-    "zero": Hidden("constant_change", "constant elbow_ref", (0.05, 0.15), "change", _zero),
-    "inertia": Hidden("constant_change", "constant elbow_armature", (0.003, 0.01), "change", _inertia),
+    "tilt": _hidden(elements.tilt((0.03, 0.1))),
+    "zero": _hidden(elements.zero("elbow", (0.05, 0.15))),
+    "inertia": _hidden(elements.inertia("elbow", (0.003, 0.01))),
 }
 
 
