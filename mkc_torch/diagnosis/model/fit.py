@@ -13,6 +13,7 @@ from torch import Tensor
 from mkc_torch import nonlinear
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.density.fit import fit_density
+from mkc_torch.diagnosis.model.affine_rounds import fitted_in_rounds
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.noise.outliers import pseudo_residual
@@ -195,9 +196,8 @@ def _fit(
 ) -> FittedModel:
     way, recorded = model.continuation(), model.prepared.recorded
     weight = rows if recorded is None else recorded_weight(recorded, rows).to(start)
-    found = nonlinear.fit(
-        way,
-        start,
+    by = partial(
+        nonlinear.fit,
         bound=bound,
         sigma=math.inf if squares else None,
         weight=weight,
@@ -210,6 +210,8 @@ def _fit(
         tol=effort.tolerance,
         jacobian=model.prepared.jacobian,
     )
+    known, start = fitted_in_rounds(way, start, by, weight, effort.tolerance)
+    found = by(way, start) if known is None else known
     there = model.begun_with(way.near(found.theta))
     residual = there.residual(found.theta).detach()
     if not bool((residual if rows is None else residual[rows > 0]).isfinite().all()):
@@ -222,18 +224,22 @@ def _fit(
         found.bound,
         residual,
         found.weights,
-        _total_log_likelihood(found, residual, weight if recorded is not None else None),
+        _total_log_likelihood(found, residual, weight if recorded is not None else None, own=known is None),
         bool(found.converged),
         squares,
     )
 
 
 def _total_log_likelihood(
-    found: nonlinear.NonlinearFit, residual: Float[Tensor, "N m"], weight: Float[Tensor, "N m"] | None
+    found: nonlinear.NonlinearFit, residual: Float[Tensor, "N m"], weight: Float[Tensor, "N m"] | None, *, own: bool
 ) -> float:
-    """Return the log-likelihood of all samples; with missing outputs, of the weighted recorded ones."""
-    if weight is None:
+    """Return the log-likelihood of all samples; with missing outputs, of the weighted recorded ones.
+
+    ``own`` states that the fit is of this residual.
+    """
+    if weight is None and own:
         return float(found.log_likelihood) * len(residual)
+    weight = torch.ones_like(residual) if weight is None else weight
     return -float((weight * mkc_nll(residual, found.sigma, found.d, found.bound)).sum())
 
 

@@ -168,6 +168,10 @@ class Expressions:
         values = self._node(Node("values", (points,)))
         return [self._node(Node("item", (values,), k)) for k in range(call.count)]
 
+    def slope(self, points: int, argument: int) -> int:
+        """The derivatives of a call's values at its points by the argument of this number."""
+        return self._node(Node("slope", (points,), argument))
+
     def function(self, node: int) -> Callable[..., Any]:
         """The NumPy function of a node that is no leaf."""
         own = self.nodes[node]
@@ -244,8 +248,7 @@ class Expressions:
         for place, argument in enumerate(self.nodes[points].arguments):
             slope = self.derivative(argument, leaf)
             if self._value(slope) != 0.0:
-                by_argument = self._node(Node("slope", (points,), place))
-                own = self._node(Node("item", (by_argument,), self.nodes[node].value))
+                own = self._node(Node("item", (self.slope(points, place),), self.nodes[node].value))
                 total = self.apply("add", total, self.apply("mul", own, slope))
         return total
 

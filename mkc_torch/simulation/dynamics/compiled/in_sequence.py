@@ -45,7 +45,7 @@ def in_sequence(traced: Traced, grid: ArrayGrid, parameters: Sequence[float], fi
         first: (w, K), initial states of the trajectories.
     """
     expressions = traced.ends.expressions
-    if len(expressions.calls) == 0 or not all(isinstance(call, ForeignCall) for call in expressions.calls):
+    if not all(isinstance(call, ForeignCall) for call in expressions.calls):
         return None
     tape = Tape(expressions, traced.ends.nodes, traced.ends.arranged)
     steps = []

@@ -109,6 +109,36 @@ class _Slopes:
     places: NDArray[np.int64]
 
 
+class MachineSteps:
+    """The steps of a traced map without calls outside torch, as a program.
+
+    Args:
+        block: the rates at the left ends of the intervals.
+        grid: the grid times.
+    """
+
+    def __init__(self, block: CompiledBlock, grid: ArrayGrid) -> None:
+        from mkc_torch.simulation.dynamics.loops.programs import CODES
+
+        self._grid = grid
+        self._program = Program(block.expressions, block.nodes, block.states, (1, len(grid.step)), CODES)
+
+    def states(self, parameters: Sequence[float], first: Array) -> Array | None:
+        """The states (w, G) from the initial states (w, K) of the trajectories; None where they diverge."""
+        from mkc_torch.simulation.dynamics.loops.steps import step_through
+
+        steps, found = machine_code(step_through), np.empty((len(first), len(self._grid.begins)))
+        assert steps is not None
+        steps(self._program.at(parameters), self._grid.step, np.ascontiguousarray(first), found)
+        return found if np.isfinite(found).all() else None
+
+
+def machine_steps(block: CompiledBlock, grid: ArrayGrid) -> MachineSteps | None:
+    """Translate the rates of a map to a program of its steps; None with calls, or where Numba is not available."""
+    usable = not block.expressions.calls and machine_code(pass_on) is not None
+    return MachineSteps(block, grid) if usable else None
+
+
 _NO_PROGRAM: ProgramAt = np.zeros((0, 5), np.int64), np.empty(0), np.empty((0, 0, 0)), np.zeros(0, np.int64), 0
 _NO_PLACES = np.zeros((0, 2), np.int64)
 _NONE = np.empty((0, 0, 0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -14,11 +15,17 @@ from mkc_torch._support.dual_constants import dual_constants
 from mkc_torch.nonlinear import load_forward_mode
 from mkc_torch.simulation.continuation import Meaning, ResidualTangents
 from mkc_torch.simulation.dynamics.compiled.affine import multiplied
+from mkc_torch.simulation.dynamics.compiled.affine_calls import with_affine_calls
 from mkc_torch.simulation.dynamics.compiled.arrays import ArraySystem
 from mkc_torch.simulation.dynamics.compiled.collocation import ArrayGrid, Collocation, Factor, ParameterSources, marched
 from mkc_torch.simulation.dynamics.compiled.expressions import Array
 from mkc_torch.simulation.dynamics.compiled.in_sequence import in_sequence
-from mkc_torch.simulation.dynamics.compiled.machine import MachineSystem, machine_system
+from mkc_torch.simulation.dynamics.compiled.machine import (
+    MachineSteps,
+    MachineSystem,
+    machine_steps,
+    machine_system,
+)
 from mkc_torch.simulation.dynamics.compiled.traced import Traceable, Traced, traced
 from mkc_torch.simulation.dynamics.observer import CLIP
 from mkc_torch.simulation.dynamics.rollout import plain_steps, rolls_out
@@ -48,6 +55,7 @@ class CompiledDynamics:
         self._system, self._meaning, self._size, self._traced = system, meaning, size, functions
         grid = system.grid
         self._grid = ArrayGrid(grid.step.numpy(), grid.begins.numpy(), grid.longest, grid.map_step is not None)
+        self.steps = self._grid.maps
         self._rows = system.rows.numpy()
         self._places = self._grid.begins.cumsum() - 1
         missing = system.missing
@@ -75,15 +83,35 @@ class CompiledDynamics:
     def _stepped(self, parameters: Tensor) -> tuple[Array, Factor | None] | None:
         """The states of a simulation that steps by its own steps; None where these are slow, or fail."""
         theta, changes = self._meaning(parameters)
-        steps = self._system.system.steps
-        if steps is not None and steps.alone and rolls_out(self._system, theta, changes):
+        steps, values = self._system.system.steps, parameters.tolist()
+        if self._steps is not None:
+            found = self._steps.states(values, self._first(values))
+        elif steps is not None and steps.alone and rolls_out(self._system, theta, changes):
             found = self._plain_steps(theta, changes)
         elif self._grid.maps and self._observed is None:
-            values = parameters.tolist()
             found = in_sequence(self._traced, self._grid, values, self._first(values))
         else:
             return None
         return None if found is None else (found, None)
+
+    def affine(self, parameters: Float[Tensor, " p"], near: Nearby) -> CompiledDynamics | None:
+        """The residual with the simulation's own steps affine at a trajectory; None without steps, or where one fails.
+
+        Near that trajectory it is the residual up to the curvature of the steps. Effects keep their own form.
+
+        Args:
+            parameters: of the trajectory.
+            near: the trajectory, as an evaluation returned it.
+        """
+        if not self._grid.maps or not isinstance(near, Trajectory):
+            return None
+        states = near.states.detach().numpy().T[:, None, :-1]
+        with np.errstate(all="ignore"):
+            ends = with_affine_calls(self._traced.ends, parameters.tolist(), states)
+        if ends is None:
+            return None
+        functions = replace(self._traced, ends=ends, middle=replace(ends, arranged=self._traced.middle.arranged))
+        return CompiledDynamics(self._system, self._meaning, self._size, functions)
 
     def _solved(self, parameters: Tensor, known: Trajectory | None) -> tuple[Array, Factor | None] | None:
         """The states from a trajectory nearby or the first guess, and the linearised equations; None without any."""
@@ -195,6 +223,12 @@ class CompiledDynamics:
     def _equations(self) -> MachineSystem | ArraySystem:
         parts = self._traced, self._grid, self._rows, self._observed
         return (None if self._grid.maps else machine_system(*parts)) or ArraySystem(*parts)
+
+    @cached_property
+    def _steps(self) -> MachineSteps | None:
+        """The steps of a map without calls, as with affine ones."""
+        usable = self._grid.maps and self._observed is None
+        return machine_steps(self._traced.ends, self._grid) if usable else None
 
     def _first(self, values: Sequence[float]) -> Array:
         """The initial states, (w, K)."""
