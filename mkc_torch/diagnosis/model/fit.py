@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -13,12 +14,12 @@ from torch import Tensor
 from mkc_torch import nonlinear
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.density.fit import fit_density
-from mkc_torch.diagnosis.model.affine_rounds import fitted_in_rounds
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.noise.outliers import pseudo_residual
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.functional import mkc_nll
+from mkc_torch.simulation.affine_rounds import fitted_in_rounds
 from mkc_torch.simulation.dynamics.missing import recorded_weight
 from mkc_torch.simulation.dynamics.other_starts import OtherStarts
 from mkc_torch.simulation.protocol import PreparedSimulation
@@ -45,20 +46,22 @@ class Effort:
         steps: number of steps at most.
         tolerance: gain in nats per sample below which it ends.
         restarts: restarts from its own end, where a scale may belong to another optimum.
+        rounds: number of rounds at most for a simulation that steps; see :mod:`mkc_torch.simulation.affine_rounds`.
     """
 
     steps: int
     tolerance: float
     restarts: int
+    rounds: int
 
 
-FULL = Effort(60, 1e-7, 2)
+FULL = Effort(60, 1e-7, 2, 10)
 """A fit to the end."""
 
-SEARCH = Effort(30, 3e-6, 0)
+SEARCH = Effort(30, 3e-6, 0, 5)
 """A fit whose likelihood is compared with others: 0.01 nats on 3,000 samples."""
 
-ROUGH = Effort(12, 1e-4, 0)
+ROUGH = Effort(12, 1e-4, 0, 2)
 """A fit that chooses between starts."""
 
 _SHARES = (1.0, 0.3, 0.1, 0.01, 0.0)
@@ -153,6 +156,7 @@ def fitted(
     fresh: bool = False,
     effort: Effort = FULL,
     squares: bool = False,
+    reference: Float[Tensor, " p"] | None = None,
 ) -> FittedModel:
     """Fit a joint model by maximum likelihood.
 
@@ -166,34 +170,42 @@ def fitted(
             it may belong to another noise model. This is slow.
         effort: how far the fit goes.
         squares: True for least squares.
+        reference: parameters of the model's own trajectory, for a simulation that steps.
 
     Raises:
         NoFitError: the simulation has no finite result at the start or at the end of the fit.
     """
-    begun = _finite_start(model, start, fresh=fresh)
-    found = _fit(*begun, bound, rows, graduate=graduate, effort=effort, squares=squares)
+    by = partial(_fit, rows=rows, squares=squares)
+    begin = partial(_finite_start, fresh=fresh)
+    found = by(model, start, bound, graduate=graduate, effort=effort, begin=begin, reference=reference)
     for _ in range(effort.restarts):
         seen = found.residual if rows is None else found.residual[rows > 0]
         if not bool((found.d > _WIDE * robust_scale(seen)).any()):
             break
         # a scale that fits the initial residuals can remain a local optimum
-        again = _fit(found.model, found.parameters, found.bound, rows, graduate=False, squares=squares)
+        again = by(found.model, found.parameters, found.bound, graduate=False)
         if not again.log_likelihood > found.log_likelihood:
             break
         found = again
     return found
 
 
+_Begun = tuple[JointModel, "Float[Tensor, ' p']"]
+
+
 def _fit(
     model: JointModel,
     start: Float[Tensor, " p"],
     bound: Float[Tensor, " m"] | None,
-    rows: Float[Tensor, " N"] | None,
     *,
+    rows: Float[Tensor, " N"] | None,
     graduate: bool,
     effort: Effort = FULL,
     squares: bool = False,
+    begin: Callable[[JointModel, Tensor], _Begun] | None = None,
+    reference: Float[Tensor, " p"] | None = None,
 ) -> FittedModel:
+    """Fit once; ``begin`` returns a model and a start with a finite result, where the simulation itself is fitted."""
     way, recorded = model.continuation(), model.prepared.recorded
     weight = rows if recorded is None else recorded_weight(recorded, rows).to(start)
     by = partial(
@@ -210,10 +222,13 @@ def _fit(
         tol=effort.tolerance,
         jacobian=model.prepared.jacobian,
     )
-    known, start = fitted_in_rounds(way, start, by, weight, effort.tolerance)
+    known = fitted_in_rounds(way, start, by, weight, effort.tolerance, effort.rounds, reference, model.prior)
+    if known is None and begin is not None:
+        model, start = begin(model, start)
+        way = model.continuation()
     found = by(way, start) if known is None else known
     there = model.begun_with(way.near(found.theta))
-    residual = there.residual(found.theta).detach()
+    residual = (there.residual if known is None else way)(found.theta).detach()
     if not bool((residual if rows is None else residual[rows > 0]).isfinite().all()):
         raise nonlinear.NoFitError("The simulation has no finite trajectory at the end of the fit.")
     return FittedModel(
@@ -310,11 +325,21 @@ def fitted_with_effect(
     base: FittedModel, model: JointModel, start: Float[Tensor, " p"], *, graduate: bool = True, effort: Effort = FULL
 ) -> FittedModel:
     """Fit a model with one more effect on the domain of a fit without it; return the latter if this fails."""
+    without = torch.cat([base.parameters, base.parameters.new_zeros(model.size - base.model.size)])
+    # a model whose trajectory is the base's
+    reference = without if model.near is base.model.near and len(model.terms) > len(base.model.terms) else None
     try:
-        return fitted(model, start, base.bound, graduate=graduate, effort=effort, squares=base.sigma_held)
+        return fitted(
+            model,
+            start,
+            base.bound,
+            graduate=graduate,
+            effort=effort,
+            squares=base.sigma_held,
+            reference=reference,
+        )
     except nonlinear.NoFitError:
-        none = base.parameters.new_zeros(model.size - base.model.size)
-        return replace(base, model=model, parameters=torch.cat([base.parameters, none]))
+        return replace(base, model=model, parameters=without)
 
 
 def without_term(fit: FittedModel, number: int) -> FittedModel:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.nonlinear import fit
+from mkc_torch.simulation.affine_rounds import fitted_in_rounds
 from mkc_torch.simulation.continuation import Continuation
 from mkc_torch.simulation.dynamics.initial_states import InitialStates, OwnStates
 from mkc_torch.simulation.dynamics.missing import recorded_weight
@@ -24,6 +25,9 @@ _HORIZONS = (0.1, 0.3, 1.0)
 
 _SAMPLES_PER_STATE = 5
 """Samples for each initial state; shorter horizons are skipped."""
+
+_TOLERANCE, _ROUNDS = 1e-8, 10
+"""Gain in nats per sample below which the rounds of a simulation that steps end, and their largest number."""
 
 
 class DynamicsCorrection:
@@ -98,8 +102,9 @@ class DynamicsCorrection:
                 if prepared.recorded is not None:
                     weight = recorded_weight(prepared.recorded, weight)
                 continuation = Continuation(prepared, partial(_with_states, known, changes, own), near)
-                far = start is None
-                begin = fit(continuation, begin, weight=weight, covariance=None, graduate=far, max_iter=60).theta
+                by = partial(fit, weight=weight, covariance=None, graduate=start is None, max_iter=60)
+                steps = fitted_in_rounds(continuation, begin, by, weight, _TOLERANCE, _ROUNDS)
+                begin = (by(continuation, begin) if steps is None else steps).theta
                 near = continuation.near(begin)
         return InitialStates(own.all(begin), near)
 

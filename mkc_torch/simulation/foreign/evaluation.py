@@ -18,7 +18,7 @@ Group = Literal["states", "inputs", "parameters"]
 GROUPS: tuple[Group, ...] = ("states", "inputs", "parameters")
 
 _REMEMBERED = 8
-"""Number of cached results: Newton's method repeats its last points, and a fit its final point."""
+"""Number of cached results, the last used: Newton's method repeats its last points, and a fit its final point."""
 
 
 class EvaluationPoints:
@@ -130,8 +130,10 @@ class CachedEvaluation(ABC):
         return self.columns(outputs, at.rows(new), at.parts[3], group, numbers, base)[new.cumsum() - 1]
 
     def _cached(self, what: Any, at: EvaluationPoints, compute: Callable[[], Array]) -> Array:
-        for known, moments, answer in self._known:
+        for place, (known, moments, answer) in enumerate(self._known):
             if known == what and moments == at:
+                del self._known[place]
+                self._known.append((known, moments, answer))
                 return answer
         found = compute()
         self._known.append((what, at, found))

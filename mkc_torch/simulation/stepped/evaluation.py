@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol
@@ -29,12 +30,18 @@ _CLOSE = 0.1
 _FEW = 2000
 """Number of points below which each has derivatives of its own."""
 
+_REMEMBERED = 8
+"""Number of courses whose derivatives are kept, the last used: fits with different effects begin from the same."""
+
 _BATCH = 200_000
 """Most steps in one call."""
 
 
 SingleStep = Callable[[Sequence[float], Sequence[float], Sequence[float], Names], Sequence[float]]
 """The states after a step, from the states, the inputs, the forces, and the parameters and constants."""
+
+_Slopes = dict[tuple[bool, Group, int], "Array"]
+"""Derivatives by outputs or rates, group and number of the variable."""
 
 
 class Steps(Protocol):
@@ -72,8 +79,8 @@ class StepperEvaluation(CachedEvaluation):
     ) -> None:
         super().__init__()
         self.stepper, self.shown, self.constants = stepper, shown, dict(constants)
-        self._slopes: dict[tuple[bool, Group, int], tuple[EvaluationPoints, Array]] = {}
-        self._compared: tuple[EvaluationPoints, EvaluationPoints, bool] | None = None
+        self._slopes: deque[tuple[EvaluationPoints, _Slopes]] = deque(maxlen=_REMEMBERED)
+        self._compared: tuple[EvaluationPoints, _Slopes] | None = None
         self.states, self.inputs, self.parameters = states, inputs, parameters
 
     def __getstate__(self) -> tuple[object, ...]:
@@ -150,19 +157,24 @@ class StepperEvaluation(CachedEvaluation):
         They are differences of many steps, and change no value: only how fast a solution converges. Along a long
         course of small steps they are interpolated.
         """
-        known = self._slopes.get((outputs, group, number))
-        if known is None or not self._near(at, known[0]):
+        known, key = self._slopes_near(at), (outputs, group, number)
+        if key not in known:
             places = _along(at)
             base = self.values(outputs, at)[places]
             found = self.columns(outputs, at.rows(places), at.parts[3], group, [number], base)[..., 0]
-            known = self._slopes[outputs, group, number] = at, _between(found, places, len(at.parts[0]))
-        return known[1]
+            known[key] = _between(found, places, len(at.parts[0]))
+        return known[key]
 
-    def _near(self, at: EvaluationPoints, known: EvaluationPoints) -> bool:
-        """Whether derivatives at points are those at others; the derivatives by many variables ask in turn."""
-        if self._compared is None or self._compared[0] is not at or self._compared[1] is not known:
-            self._compared = at, known, at.near(known, _NEAR)
-        return self._compared[2]
+    def _slopes_near(self, at: EvaluationPoints) -> _Slopes:
+        """The known derivatives at points or nearby; the derivatives by many variables ask in turn."""
+        if self._compared is None or self._compared[0] is not at:
+            near = [place for place, (points, _) in enumerate(self._slopes) if at.near(points, _NEAR)]
+            points, known = self._slopes[near[-1]] if near else (at, {})
+            if near:
+                del self._slopes[near[-1]]
+            self._slopes.append((points, known))
+            self._compared = at, known
+        return self._compared[1]
 
     def columns(
         self,

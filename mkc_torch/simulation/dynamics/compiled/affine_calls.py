@@ -56,8 +56,10 @@ def with_affine_calls(block: CompiledBlock, parameters: Sequence[float], states:
     for node in needed:
         if node not in inside:
             own[node] = _copied(old, node, new, own, affine)
-    leaves = [[new.leaf(*_leaf(old, node)) for node in group] for group in (block.states, block.parameters)]
-    return CompiledBlock(new, [own[node] for node in block.nodes], *leaves, block.arranged)
+    states_of, parameters_of = (
+        [new.leaf(*_leaf(old, node)) for node in group] for group in (block.states, block.parameters)
+    )
+    return CompiledBlock(new, [own[node] for node in block.nodes], states_of, parameters_of, block.arranged)
 
 
 def _copied(old: Expressions, node: int, new: Expressions, own: dict[int, int], affine: Any) -> int:

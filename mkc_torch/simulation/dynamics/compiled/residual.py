@@ -105,7 +105,7 @@ class CompiledDynamics:
         """
         if not self._grid.maps or not isinstance(near, Trajectory):
             return None
-        states = near.states.detach().numpy().T[:, None, :-1]
+        states = self._guess_nearby(near, self._first(parameters.tolist()))[0][:, None, :-1]
         with np.errstate(all="ignore"):
             ends = with_affine_calls(self._traced.ends, parameters.tolist(), states)
         if ends is None:
