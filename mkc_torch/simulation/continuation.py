@@ -104,7 +104,11 @@ class Continuation:
             self._known.move_to_end(key)
             while len(self._known) > _MOST_KEPT:
                 self._known.popitem(last=False)
-        self._same = (key, residual) if is_plain(parameters) else None
+        # the steps of a simulator are slow, and a solution of theirs does not depend on its start
+        steps = (
+            is_plain(parameters) and self._compiled is not None and bool(self._compiled[0] and self._compiled[0].steps)
+        )
+        self._same = (key, residual) if steps else None
         return residual
 
     def tangents(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, "p N m"] | None:

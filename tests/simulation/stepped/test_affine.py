@@ -84,3 +84,15 @@ def test_rounds_of_affine_steps_end_at_the_fit_by_the_simulation_s_own_steps(tmp
     assert abs(float(found.log_likelihood - expected.log_likelihood)) < 1e-5
     torch.testing.assert_close(residual, best, rtol=0, atol=1e-4 * float(best.abs().max()))
     assert len(rollouts) < expected.n_iter
+
+
+def test_a_residual_of_steps_is_computed_once_at_its_parameters(tmp_path):
+    prepared, changes = cases(tmp_path)["followed"]
+    own, start = continuation_of(prepared, changes)
+    answers, answered = [], own._answer
+    own._answer = lambda *given: (answers.append(given), answered(*given))[1]
+    first = own(start)
+    assert own.affine(start) is not None
+    assert own(start) is first
+    assert len(answers) == 1
+    assert not torch.equal(own(1.01 * start), first)

@@ -101,6 +101,26 @@ def test_derivatives_along_a_long_course_are_interpolated():
     assert steps[1] < 0.3 * len(time)  # after the values at all points
 
 
+def test_derivatives_of_the_courses_used_last_are_kept():
+    evaluation = Steps().prepare(recording_of()).system._evaluation
+    time = 0.01 * np.arange(200)
+
+    def course(size):
+        states = size * np.stack([np.sin(time), np.cos(time)], 1)
+        return EvaluationPoints(time, states, np.zeros((200, 2)), np.array([0.5, 4.0, 0.1]))
+
+    steps = []
+    fresh, evaluation.fresh = evaluation.fresh, lambda *given: (steps.append(1), fresh(*given))[1]
+    first = evaluation.slope(False, course(1.0), "states", 0)
+    for size in (2.0, 3.0, 4.0):
+        assert not np.array_equal(evaluation.slope(False, course(size), "states", 0), first)
+    counted = len(steps)
+    assert evaluation.slope(False, course(1.0), "states", 0) is first
+    assert len(steps) == counted
+    evaluation.slope(False, course(1.0), "states", 1)  # by another variable
+    assert len(steps) > counted
+
+
 class Squares:
     """A call of two values of its three arguments: the time, a state, an input."""
 
