@@ -239,23 +239,30 @@ def _fit(
         found.bound,
         residual,
         found.weights,
-        _total_log_likelihood(found, residual, weight if recorded is not None else None, own=known is None),
+        _total_log_likelihood(found, residual, weight, by_mean=recorded is None, own=known is None),
         bool(found.converged),
         squares,
     )
 
 
 def _total_log_likelihood(
-    found: nonlinear.NonlinearFit, residual: Float[Tensor, "N m"], weight: Float[Tensor, "N m"] | None, *, own: bool
+    found: nonlinear.NonlinearFit,
+    residual: Float[Tensor, "N m"],
+    weight: Tensor | None,
+    *,
+    by_mean: bool,
+    own: bool,
 ) -> float:
     """Return the log-likelihood of all samples; with missing outputs, of the weighted recorded ones.
 
-    ``own`` states that the fit is of this residual.
+    ``by_mean`` extends the mean of the weighted samples to all; ``own`` states that the fit is of this residual.
     """
-    if weight is None and own:
-        return float(found.log_likelihood) * len(residual)
-    weight = torch.ones_like(residual) if weight is None else weight
-    return -float((weight * mkc_nll(residual, found.sigma, found.d, found.bound)).sum())
+    N = len(residual)
+    if by_mean and own:
+        return float(found.log_likelihood) * N
+    weight = residual.new_ones(N, 1) if weight is None else weight.reshape(N, -1)
+    total = -float((weight * mkc_nll(residual, found.sigma, found.d, found.bound)).sum())
+    return total * N / float(weight.sum()) if by_mean else total
 
 
 def by_least_squares(fit: FittedModel, effort: Effort = FULL) -> FittedModel | None:

@@ -3,6 +3,9 @@
 import pytest
 import torch
 
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.functional import mkc_nll
 from mkc_torch.nonlinear import fit as nonlinear_fit
 from mkc_torch.simulation import affine_rounds
 from mkc_torch.simulation.continuation import Continuation
@@ -96,3 +99,13 @@ def test_a_residual_of_steps_is_computed_once_at_its_parameters(tmp_path):
     assert own(start) is first
     assert len(answers) == 1
     assert not torch.equal(own(1.01 * start), first)
+
+
+def test_the_likelihood_of_a_fit_with_left_out_samples_is_that_of_the_others():
+    model = JointModel(Pendulum().prepare(swinging(0.9, noise=0.002)))
+    start = model.prepared.start()
+    rows = torch.ones(len(model.prepared.measured), dtype=torch.float64)
+    rows[50:90] = 0.0
+    found = fitted(model, start, rows=rows)
+    seen = -float(mkc_nll(found.residual[rows > 0], found.sigma, found.d, found.bound).sum())
+    assert found.log_likelihood == pytest.approx(seen * len(rows) / float(rows.sum()), rel=1e-9)
