@@ -27,7 +27,7 @@ from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.draws import drawn
 from mkc_torch.simulation.dynamics.entries import typical_gains
-from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
+from mkc_torch.simulation.dynamics.flow import changes_by_inputs, flow_of, plausible_sizes
 from mkc_torch.simulation.dynamics.horizons import horizons_of, log_likelihood_ahead, per_sample
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid, key_of
@@ -67,7 +67,8 @@ class ScoreBasis:
         choice: nats for the choice of an effect, the logarithm of the number of candidates.
         rounding: smallest white noise of each output.
         declared: known standard deviations of the outputs' white noise, by output.
-        largest: (p+m,), largest plausible change of each rate and drift of each output.
+        largest: (p+m,), largest plausible process noise of each rate and drift of each output.
+        changes: (p,), largest plausible change of each rate by an effect.
     """
 
     horizons: tuple[int, ...]
@@ -79,6 +80,7 @@ class ScoreBasis:
     rounding: tuple[float, ...]
     declared: Mapping[str, float]
     largest: Float[np.ndarray, " p+m"]
+    changes: Float[np.ndarray, " p"]
 
     @property
     def number(self) -> float:
@@ -144,7 +146,8 @@ def basis_of(base: FittedModel, candidates: int, declared: Mapping[str, float], 
         raise NoFitError("The simulation has no finite trajectory at the fitted values.")
     theta, changes = base.parameters[: base.model.base], base.model.changes(base.parameters)
     largest = plausible_sizes(prepared, theta, changes, base.model.near)
-    basis = ScoreBasis(horizons_of(flow), span, counts, len(counts), 1.0, choice, rounding, declared, largest)
+    effects = np.maximum(IMPLAUSIBLE * largest[: len(prepared.disturbable)], changes_by_inputs(prepared, theta))
+    basis = ScoreBasis(horizons_of(flow), span, counts, len(counts), 1.0, choice, rounding, declared, largest, effects)
     fits = [fit for fit in (base, base.open_loop) if fit is not None]
     scored = [(fit, found) for fit in fits if (found := score(fit, basis, settings)) is not None]
     if not scored:
@@ -273,19 +276,19 @@ def _flow(fit: FittedModel) -> Flow | None:
 
 
 def is_implausible(fit: FittedModel, basis: ScoreBasis) -> bool:
-    """Whether an effect changes a rate by far more than the rates of the recording, so that two changes cancel.
+    """Whether an effect changes a rate by far more than the recording's rates and its inputs: two changes cancel.
 
     Or whether effects take a parameter out of its bounds for more than a tenth of the recording.
 
     Args:
         fit: the model.
-        basis: with the largest rates of the recording.
+        basis: with the largest changes of the rates.
     """
     if not fit.model.terms:
         return False
     model, prepared = fit.model, fit.model.prepared.dynamics
     assert prepared is not None
-    largest = dict(zip(prepared.disturbable, basis.largest, strict=False))
+    largest = dict(zip(prepared.disturbable, basis.changes, strict=True))
     signals = model.signals(fit.parameters)
     for name in {term.port for term in model.terms if prepared.ports[term.port].kind == "parameter"}:
         known = prepared.known[prepared.ports[name].channels[0]]
@@ -300,7 +303,7 @@ def is_implausible(fit: FittedModel, basis: ScoreBasis) -> bool:
         change = term.effect.change(gamma, term.shape, term.context(prepared, signal))[:, 0].detach()
         usual = float(change.abs().nan_to_num(torch.inf).quantile(_USUAL))
         gains = typical_gains(prepared.open_loop(), port.channels[0]) if port.kind == ENTRY else {port.channels[0]: 1.0}
-        if any(not gain * usual <= IMPLAUSIBLE * largest[name] for name, gain in gains.items() if name in largest):
+        if any(not gain * usual <= largest[name] for name, gain in gains.items() if name in largest):
             return True
     return False
 

@@ -31,8 +31,8 @@ GENERALISATION = 5.0
 """Price in nats of a form that includes named forms as special cases, as a power law includes drags. By judgement."""
 
 IMPLAUSIBLE = 10.0
-"""Multiple of a rate's largest value in the recording that no effect changes it by, and of an effect's largest
-plausible size above which a finding is unconfirmed. By judgement: an order of magnitude."""
+"""Multiple of a rate's largest value in the recording that no effect changes it by unless the inputs do, and of an
+effect's largest plausible size above which a finding is unconfirmed. By judgement: an order of magnitude."""
 
 WIDTH = 6
 """Models of the beam. By judgement: more cost time."""

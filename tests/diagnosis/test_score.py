@@ -182,7 +182,7 @@ def test_a_lost_trajectory_has_no_score() -> None:
 def test_an_implausible_size_has_no_score() -> None:
     alone, friction = fits(Slide(), recorded(0, friction=0.05))
     basis = basis_of(alone, 10, {}, Settings())
-    smaller = replace(basis, largest=1e-4 * basis.largest)
+    smaller = replace(basis, changes=1e-4 * basis.changes)
     assert score(friction, basis, Settings()) is not None
     assert score(friction, smaller, Settings()) is None
 
@@ -212,5 +212,5 @@ def test_the_variance_ratio_of_overlapping_sums_is_their_length() -> None:
 
 
 def test_the_price_of_a_number_is_half_the_logarithm_of_the_samples_times_kappa() -> None:
-    basis = ScoreBasis((1,), np.ones(1), np.ones((100, 1)), 100, 3.0, 0.0, (0.0,), {}, np.ones(2))
+    basis = ScoreBasis((1,), np.ones(1), np.ones((100, 1)), 100, 3.0, 0.0, (0.0,), {}, np.ones(2), np.ones(1))
     assert basis.number == pytest.approx(1.5 * math.log(100))

@@ -222,10 +222,14 @@ def _fit(
         tol=effort.tolerance,
         jacobian=model.prepared.jacobian,
     )
-    known = fitted_in_rounds(way, start, by, weight, effort.tolerance, effort.rounds, reference, model.prior)
+    rounds = partial(
+        fitted_in_rounds, fit=by, weight=weight, tolerance=effort.tolerance, rounds=effort.rounds, prior=model.prior
+    )
+    known = rounds(way, start, reference=reference)
     if known is None and begin is not None:
         model, start = begin(model, start)
         way = model.continuation()
+        known = rounds(way, start)
     found = by(way, start) if known is None else known
     there = model.begun_with(way.near(found.theta))
     residual = (there.residual if known is None else way)(found.theta).detach()

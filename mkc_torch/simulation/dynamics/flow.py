@@ -59,6 +59,28 @@ def plausible_sizes(
     return largest
 
 
+def changes_by_inputs(prepared: Observable, theta: Float[Tensor, " p"]) -> Float[np.ndarray, " p"]:
+    """How much the inputs change each rate that a disturbance can act on, along the first guess of the states.
+
+    The servo of a joint and its friction cancel nearly, so each alone can be far larger than the rates of a recording.
+
+    Args:
+        prepared: the simulation.
+        theta: its parameters.
+
+    Returns:
+        The quantile of the rates' differences from those with all inputs at their medians, in the rates' units.
+    """
+    free = prepared.observed(None)
+    at, now = free.grid.spread(free.guess), free.acting(theta, {})
+    held = now._replace(inputs=now.inputs.median(0).values.expand_as(now.inputs))
+    own, without = (free.rate(theta, {}, acting)(at) for acting in (now, held))
+    places = [free.system.states.index(name) for name in free.disturbable]
+    moved = (own - without)[:, places].detach().abs().nan_to_num(0.0, 0.0)
+    changes: np.ndarray = torch.quantile(moved, _RATE_QUANTILE, 0).double().cpu().numpy()
+    return changes
+
+
 def flow_of(prepared: Observable, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None) -> Flow | None:
     """Linearise a trajectory, in open loop or with an observer; None where no trajectory is found.
 

@@ -17,7 +17,7 @@ from mkc_torch.diagnosis.search.beam import BeamSearch
 from mkc_torch.diagnosis.search.candidate import Candidate, in_order, model_key
 from mkc_torch.diagnosis.search.move_fits import at_other_values
 from mkc_torch.diagnosis.settings import Settings
-from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE, LARGER
+from mkc_torch.diagnosis.thresholds import LARGER
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation import Dynamics, Parameter
 from tests.diagnosis.cart import DRAG, FRICTION, NOISE, cart_recording, cart_terms, first_term, fit_with, free_fit
@@ -145,7 +145,7 @@ def test_an_implausible_size_has_no_score(factor, scored):
     alone = start(DRAG, 0.0)
     model = alone.model.with_term(first_term(alone, "constant_force"))
     beam = beam_of(alone, cart_terms(alone, *NAMES))
-    size = factor * IMPLAUSIBLE * float(beam.basis.largest[0])
+    size = factor * float(beam.basis.changes[0])
     fit = replace(alone, model=model, parameters=torch.cat([alone.parameters, alone.parameters.new_tensor([size])]))
     candidate = Candidate(fit, score(fit, beam.basis, SETTINGS), "")
     assert (candidate.score is not None) is scored

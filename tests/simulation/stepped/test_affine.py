@@ -54,10 +54,15 @@ def test_the_error_of_affine_steps_is_of_second_order(name, tmp_path):
     assert 3.0 < errors[0] / errors[1] < 5.0
 
 
-def test_machine_code_and_python_take_the_same_affine_steps(tmp_path, monkeypatch):
+@pytest.mark.parametrize("observed", [False, True])
+def test_machine_code_and_python_take_the_same_affine_steps(observed, tmp_path, monkeypatch):
     prepared, changes = cases(tmp_path)["joint"]
+    prepared = with_strong_observer(prepared, prepared.start(), 0.1) if observed else prepared
     own, start = continuation_of(prepared, changes)
-    moved, by_machine_code = 1.01 * start, own.affine(start)(1.01 * start)
+    real, loops, moved = machine.machine_code, [], 1.01 * start
+    monkeypatch.setattr(machine, "machine_code", lambda loop: loops.append(loop.__name__) or real(loop))
+    by_machine_code = own.affine(start)(moved)
+    assert "step_through" in loops
     monkeypatch.setattr(machine, "machine_code", lambda _: None)
     by_python = own.affine(start)(moved)
     torch.testing.assert_close(by_python, by_machine_code, rtol=0, atol=1e-11)

@@ -10,10 +10,12 @@ from operator import itemgetter
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mkc_torch.simulation.dynamics.compiled.collocation import ArrayGrid
 from mkc_torch.simulation.dynamics.compiled.expressions import FUNCTIONS, Array, Expressions
 from mkc_torch.simulation.dynamics.compiled.foreign import ForeignCall
+from mkc_torch.simulation.dynamics.compiled.functions import CompiledBlock
 from mkc_torch.simulation.dynamics.compiled.tape import Tape
 from mkc_torch.simulation.dynamics.compiled.traced import Traced
 
@@ -35,7 +37,14 @@ _OF_NUMBERS: dict[str, Callable[..., Any]] = {
 """Functions of single numbers that are faster than those of NumPy and have the same values."""
 
 
-def in_sequence(traced: Traced, grid: ArrayGrid, parameters: Sequence[float], first: Array) -> Array | None:
+def in_sequence(
+    traced: Traced,
+    grid: ArrayGrid,
+    parameters: Sequence[float],
+    first: Array,
+    rows: NDArray[np.int64],
+    observed: tuple[Array, Array] | None = None,
+) -> Array | None:
     """Return the states (w, G) by single steps; None where the simulation has none that are fast, or fails.
 
     Args:
@@ -43,20 +52,13 @@ def in_sequence(traced: Traced, grid: ArrayGrid, parameters: Sequence[float], fi
         grid: its grid times.
         parameters: its parameters.
         first: (w, K), initial states of the trajectories.
+        rows: (N,), grid index of each sample.
+        observed: gain (k, m, N) and clipping limit (m, N) of its observer; None without an observer.
     """
-    expressions = traced.ends.expressions
-    if not all(isinstance(call, ForeignCall) for call in expressions.calls):
+    rates = _single_steps(traced.ends, parameters)
+    correct = None if observed is None else _corrections(traced, parameters, rows, *observed)
+    if rates is None or (observed is not None and correct is None):
         return None
-    tape = Tape(expressions, traced.ends.nodes, traced.ends.arranged)
-    steps = []
-    for function, slot, arguments, node in tape.steps:
-        of_numbers = _of_numbers(expressions, node) or function
-        if of_numbers is _NONE:
-            return None
-        steps.append((of_numbers, slot, arguments))
-    slots, states = tape.values_at(parameters), tape.states
-    columns = [(k, value.reshape(-1).tolist()) for k, value in enumerate(slots) if np.ndim(value) > 0]
-    own = [float(value) if np.ndim(value) == 0 and value is not None else value for value in slots]
     found = np.empty((len(grid.begins), len(first)))
     x, place = first[:, 0].tolist(), 0
     found[0] = x
@@ -66,17 +68,67 @@ def in_sequence(traced: Traced, grid: ArrayGrid, parameters: Sequence[float], fi
                 place += 1
                 x = first[:, place].tolist()
             else:
-                for slot, values in columns:
-                    own[slot] = values[k]
-                for slot, index in states:
-                    own[slot] = x[index]
-                for function, slot, arguments in steps:
-                    own[slot] = function(*[own[argument] for argument in arguments])
-                x = [value + h * own[output] for value, output in zip(x, tape.outputs, strict=True)]
+                if correct is not None:
+                    x = correct(k, x)
+                x = [value + h * rate for value, rate in zip(x, rates(k, x), strict=True)]
             found[k + 1] = x
     except (OverflowError, ValueError, ZeroDivisionError):  # a state that diverges
         return None
     return np.ascontiguousarray(found.T) if np.isfinite(found).all() else None
+
+
+_Single = Callable[[int, Sequence[float]], list[float]]
+
+
+def _single_steps(block: CompiledBlock, parameters: Sequence[float]) -> _Single | None:
+    """The nodes of a block at a place and its states; None where a call has no single steps."""
+    expressions = block.expressions
+    if not all(isinstance(call, ForeignCall) for call in expressions.calls):
+        return None
+    tape = Tape(expressions, block.nodes, block.arranged)
+    steps = []
+    for function, slot, arguments, node in tape.steps:
+        of_numbers = _of_numbers(expressions, node) or function
+        if of_numbers is _NONE:
+            return None
+        steps.append((of_numbers, slot, arguments))
+    slots, states, outputs = tape.values_at(parameters), tape.states, tape.outputs
+    columns = [(k, value.reshape(-1).tolist()) for k, value in enumerate(slots) if np.ndim(value) > 0]
+    own = [float(value) if np.ndim(value) == 0 and value is not None else value for value in slots]
+
+    def single(place: int, x: Sequence[float]) -> list[float]:
+        for slot, values in columns:
+            own[slot] = values[place]
+        for slot, index in states:
+            own[slot] = x[index]
+        for function, slot, arguments in steps:
+            own[slot] = function(*[own[argument] for argument in arguments])
+        return [own[output] for output in outputs]
+
+    return single
+
+
+def _corrections(
+    traced: Traced, parameters: Sequence[float], rows: NDArray[np.int64], gain: Array, limit: Array
+) -> Callable[[int, list[float]], list[float]] | None:
+    """The states just after a grid time from those before, with an observer; None without single steps."""
+    new = None if traced.new is None else _single_steps(traced.new, parameters)
+    if new is None:
+        return None
+    innovations, samples = new, {row: sample for sample, row in enumerate(rows.tolist())}
+    gains, limits = np.moveaxis(gain, -1, 0).tolist(), limit.T.tolist()
+
+    def corrected(place: int, x: list[float]) -> list[float]:
+        sample = samples.get(place)
+        if sample is None:
+            return x
+        pairs = zip(innovations(sample, x), limits[sample], strict=True)
+        moved, after = [most * math.tanh(value / most) for value, most in pairs], list(x)
+        for state, row in zip(traced.places, gains[sample], strict=True):
+            after[state] += sum(map(operator.mul, row, moved))
+        return after
+
+    return corrected
 
 
 def _none(*_: Any) -> None:

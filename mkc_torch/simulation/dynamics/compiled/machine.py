@@ -15,6 +15,7 @@ from mkc_torch.simulation.dynamics.compiled.collocation import ArrayGrid, Colloc
 from mkc_torch.simulation.dynamics.compiled.expressions import Array
 from mkc_torch.simulation.dynamics.compiled.functions import CompiledBlock, CompiledObserverJump, Derivatives
 from mkc_torch.simulation.dynamics.compiled.program import Program, ProgramAt
+from mkc_torch.simulation.dynamics.compiled.tape import needed_nodes
 from mkc_torch.simulation.dynamics.loops.machine_code import machine_code
 from mkc_torch.simulation.dynamics.loops.recurrence import pass_on
 
@@ -44,11 +45,7 @@ class MachineSystem:
     ) -> None:
         self._traced, self.grid, self.rows = traced, grid, rows
         self._stations, self._samples = (3, len(grid.step)), (1, len(rows))
-        gain, limit = (np.empty((0, 0, 0)), np.empty((0, 0))) if observed is None else observed
-        sample = np.full(0 if observed is None else len(grid.begins), -1)
-        if observed is not None:
-            sample[rows] = np.arange(len(rows))
-        self._observer = gain, limit, np.array(traced.places, dtype=np.int64), sample
+        self._observer = _observer(traced, grid, rows, observed)
 
     def at(self, parameters: Sequence[float]) -> MachineCollocation:
         """The collocation at given parameters. The caller silences warnings of NumPy."""
@@ -76,14 +73,14 @@ class MachineSystem:
     @cached_property
     def _rates(self) -> tuple[Program, _Slopes]:
         block = self._traced.ends
-        return self._program(block, block.nodes, self._stations), self._slopes(block, block.by_states, self._stations)
+        return _program(block, block.nodes, self._stations), self._slopes(block, block.by_states, self._stations)
 
     @cached_property
     def _innovations(self) -> tuple[Program, _Slopes] | None:
         block = self._traced.new
         if block is None:
             return None
-        return self._program(block, block.nodes, self._samples), self._slopes(block, block.by_states, self._samples)
+        return _program(block, block.nodes, self._samples), self._slopes(block, block.by_states, self._samples)
 
     @cached_property
     def by_parameters(self) -> tuple[list[int], _Slopes]:
@@ -93,12 +90,7 @@ class MachineSystem:
 
     def _slopes(self, block: CompiledBlock, derivatives: Derivatives, shape: tuple[int, int]) -> _Slopes:
         places = np.array(derivatives.places, dtype=np.int64).reshape(-1, 2)
-        return _Slopes(self._program(block, derivatives.nodes, shape), places)
-
-    def _program(self, block: CompiledBlock, nodes: Sequence[int], shape: tuple[int, int]) -> Program:
-        from mkc_torch.simulation.dynamics.loops.programs import CODES
-
-        return Program(block.expressions, nodes, block.states, shape, CODES)
+        return _Slopes(_program(block, derivatives.nodes, shape), places)
 
 
 @dataclass(frozen=True)
@@ -110,18 +102,23 @@ class _Slopes:
 
 
 class MachineSteps:
-    """The steps of a traced map without calls outside torch, as a program.
+    """The steps of a traced map without calls outside torch, as programs.
 
     Args:
-        block: the rates at the left ends of the intervals.
+        traced: the map.
         grid: the grid times.
+        rows: (N,), grid index of each sample.
+        observed: gain (k, m, N) and clipping limit (m, N) of its observer; None without an observer.
     """
 
-    def __init__(self, block: CompiledBlock, grid: ArrayGrid) -> None:
-        from mkc_torch.simulation.dynamics.loops.programs import CODES
-
+    def __init__(
+        self, traced: Traced, grid: ArrayGrid, rows: NDArray[np.int64], observed: tuple[Array, Array] | None
+    ) -> None:
         self._grid = grid
-        self._program = Program(block.expressions, block.nodes, block.states, (1, len(grid.step)), CODES)
+        self._program = _program(traced.ends, traced.ends.nodes, (1, len(grid.step)))
+        new = traced.new
+        self._innovations = None if new is None else _program(new, new.nodes, (1, len(rows)))
+        self._observer = _observer(traced, grid, rows, observed)
 
     def states(self, parameters: Sequence[float], first: Array) -> Array | None:
         """The states (w, G) from the initial states (w, K) of the trajectories; None where they diverge."""
@@ -129,14 +126,46 @@ class MachineSteps:
 
         steps, found = machine_code(step_through), np.empty((len(first), len(self._grid.begins)))
         assert steps is not None
-        steps(self._program.at(parameters), self._grid.step, np.ascontiguousarray(first), found)
+        innovations = _NO_PROGRAM if self._innovations is None else self._innovations.at(parameters)
+        jump = innovations, *self._observer
+        steps(self._program.at(parameters), jump, self._grid.step, np.ascontiguousarray(first), found)
         return found if np.isfinite(found).all() else None
 
 
-def machine_steps(block: CompiledBlock, grid: ArrayGrid) -> MachineSteps | None:
-    """Translate the rates of a map to a program of its steps; None with calls, or where Numba is not available."""
-    usable = not block.expressions.calls and machine_code(pass_on) is not None
-    return MachineSteps(block, grid) if usable else None
+def machine_steps(
+    traced: Traced, grid: ArrayGrid, rows: NDArray[np.int64], observed: tuple[Array, Array] | None
+) -> MachineSteps | None:
+    """Translate a traced map to a program of its steps; None with calls, or where Numba is not available.
+
+    Args:
+        traced, grid, rows, observed: as in :func:`machine_system`.
+    """
+    blocks = [block for block in (traced.ends, traced.new) if block is not None]
+    usable = not any(_calls(block) for block in blocks) and machine_code(pass_on) is not None
+    return MachineSteps(traced, grid, rows, observed) if usable else None
+
+
+def _calls(block: CompiledBlock) -> bool:
+    """Whether a block needs a function outside torch."""
+    nodes = block.expressions.nodes
+    return any(nodes[node].operation == "values" for node in needed_nodes(block.expressions, block.nodes))
+
+
+def _program(block: CompiledBlock, nodes: Sequence[int], shape: tuple[int, int]) -> Program:
+    from mkc_torch.simulation.dynamics.loops.programs import CODES
+
+    return Program(block.expressions, nodes, block.states, shape, CODES)
+
+
+def _observer(
+    traced: Traced, grid: ArrayGrid, rows: NDArray[np.int64], observed: tuple[Array, Array] | None
+) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int64]]:
+    """Gain, limit, corrected states and the sample of each grid time, or -1; empty without an observer."""
+    gain, limit = (np.empty((0, 0, 0)), np.empty((0, 0))) if observed is None else observed
+    sample = np.full(0 if observed is None else len(grid.begins), -1)
+    if observed is not None:
+        sample[rows] = np.arange(len(rows))
+    return gain, limit, np.array(traced.places, dtype=np.int64), sample
 
 
 _NO_PROGRAM: ProgramAt = np.zeros((0, 5), np.int64), np.empty(0), np.empty((0, 0, 0)), np.zeros(0, np.int64), 0

@@ -88,8 +88,8 @@ class CompiledDynamics:
             found = self._steps.states(values, self._first(values))
         elif steps is not None and steps.alone and rolls_out(self._system, theta, changes):
             found = self._plain_steps(theta, changes)
-        elif self._grid.maps and self._observed is None:
-            found = in_sequence(self._traced, self._grid, values, self._first(values))
+        elif self._grid.maps:
+            found = in_sequence(self._traced, self._grid, values, self._first(values), self._rows, self._observed)
         else:
             return None
         return None if found is None else (found, None)
@@ -227,8 +227,8 @@ class CompiledDynamics:
     @cached_property
     def _steps(self) -> MachineSteps | None:
         """The steps of a map without calls, as with affine ones."""
-        usable = self._grid.maps and self._observed is None
-        return machine_steps(self._traced.ends, self._grid) if usable else None
+        known = self._traced, self._grid, self._rows, self._observed
+        return machine_steps(*known) if self._grid.maps else None
 
     def _first(self, values: Sequence[float]) -> Array:
         """The initial states, (w, K)."""
