@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.functional import mkc_nll
-from mkc_torch.nonlinear import GaussianPrior, NoFitError, NonlinearFit
+from mkc_torch.nonlinear import NoFitError, NonlinearFit
 from mkc_torch.simulation.continuation import Continuation
 
 if TYPE_CHECKING:
@@ -32,13 +32,13 @@ def fitted_in_rounds(
     tolerance: float,
     rounds: int,
     reference: Float[Tensor, " p"] | None = None,
-    prior: GaussianPrior | None = None,
+    log_prior: Callable[[Tensor], float] = lambda _: 0.0,
 ) -> NonlinearFit | None:
     """Return a fit by affine steps; None for a simulation without steps, or where the first round fails.
 
     A round fits with the steps that are affine near the last parameters, and then runs the simulation itself; where
-    that is worse, over a shorter way. The rounds end where both agree, or where nothing is gained: the affine steps
-    have the simulation's own values and derivatives at the last parameters.
+    that is worse than before, over a shorter way. The rounds end where both agree, or where nothing is gained: the
+    affine steps have the simulation's own values and derivatives at the last parameters.
 
     Args:
         way: the residual.
@@ -48,11 +48,11 @@ def fitted_in_rounds(
         tolerance: gain in nats per sample below which a fit ends.
         rounds: number of rounds at most.
         reference: parameters at whose trajectory the steps of the first round are affine; default those of the start.
-        prior: of the parameters, as in the fit.
+        log_prior: logarithm of the parameters' prior density, as in the fit.
     """
 
     def value_of(residual: Continuation, found: NonlinearFit) -> float:
-        return _log_likelihood(residual(found.theta), found, weight) + _log_prior(found.theta, prior)
+        return _log_likelihood(residual(found.theta), found, weight) + log_prior(found.theta)
 
     best, value, at = None, -torch.inf, start
     affine = way.affine(start if reference is None else reference, given=reference is not None)
@@ -65,6 +65,10 @@ def fitted_in_rounds(
             break
         agreed = _AGREED * tolerance * len(found.weights)
         predicted, own = value_of(affine, found), value_of(way, found)
+        if best is None and not abs(predicted - own) <= agreed:
+            begun = replace(found, theta=start)
+            value = value_of(way, begun)
+            best = begun if isfinite(value) else None
         for share in _SHARES if own < value - agreed or not isfinite(own) else ():
             if own < value or not isfinite(own):
                 found = replace(found, theta=torch.lerp(at, found.theta, share))
@@ -84,7 +88,7 @@ def _fitted(
 ) -> NonlinearFit | None:
     try:
         return None if affine is None else fit(affine, start)
-    except NoFitError:
+    except (NoFitError, ArithmeticError):  # affine steps can diverge where the simulation is nearly unstable
         return None
 
 
@@ -94,12 +98,3 @@ def _log_likelihood(residual: Float[Tensor, "N m"], found: NonlinearFit, weight:
         return -torch.inf
     nats = mkc_nll(residual, found.sigma, found.d, found.bound)
     return -float((nats if weight is None else weight.reshape(len(residual), -1) * nats).sum())
-
-
-def _log_prior(theta: Float[Tensor, " p"], prior: GaussianPrior | None) -> float:
-    """The logarithm of the prior's density, up to its constant."""
-    if prior is None:
-        return 0.0
-    away = theta - prior.mean
-    precise = prior.precision * away if prior.precision.ndim == 1 else prior.precision @ away
-    return -0.5 * float(away @ precise)

@@ -208,23 +208,24 @@ def _fit(
     """Fit once; ``begin`` returns a model and a start with a finite result, where the simulation itself is fitted."""
     way, recorded = model.continuation(), model.prepared.recorded
     weight = rows if recorded is None else recorded_weight(recorded, rows).to(start)
+    (lower, upper), logarithms = model.bounds or (None, None), model.logarithms
     by = partial(
         nonlinear.fit,
         bound=bound,
         sigma=math.inf if squares else None,
         weight=weight,
         prior=model.prior,
-        lower=None if model.bounds is None else model.bounds[0],
-        upper=None if model.bounds is None else model.bounds[1],
+        lower=lower,
+        upper=upper,
         graduate=graduate,
         covariance=None,
         max_iter=effort.steps,
         tol=effort.tolerance,
         jacobian=model.prepared.jacobian,
     )
-    rounds = partial(
-        fitted_in_rounds, fit=by, weight=weight, tolerance=effort.tolerance, rounds=effort.rounds, prior=model.prior
-    )
+    by = by if logarithms is None else partial(logarithms.fit, by=by, bounds=model.bounds)
+    rounds = partial(fitted_in_rounds, fit=by, weight=weight, tolerance=effort.tolerance, rounds=effort.rounds)
+    rounds = rounds if logarithms is None else partial(rounds, log_prior=logarithms.log_prior)
     known = rounds(way, start, reference=reference)
     if known is None and begin is not None:
         model, start = begin(model, start)

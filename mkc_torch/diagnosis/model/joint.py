@@ -19,6 +19,7 @@ from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.waveforms import apply_basis, outer_product
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.simulation.continuation import CompiledResidual, Continuation, is_plain
+from mkc_torch.simulation.logarithms import Logarithms
 from mkc_torch.simulation.ports import Answer, Change, FreeChange, Nearby
 from mkc_torch.simulation.protocol import PreparedSimulation
 
@@ -64,6 +65,18 @@ class JointModel:
         if precision.dim() == 1:
             return GaussianPrior(torch.cat([known.mean, more]), torch.cat([precision, more]))
         return GaussianPrior(torch.cat([known.mean, more]), torch.block_diag(precision, torch.diag(more)))
+
+    @property
+    def logarithms(self) -> Logarithms | None:
+        """Coordinates of a fit of a simulation that steps; None for others, and without positive parameters there."""
+        system, prior = self.prepared.dynamics, self.prior
+        if system is None or system.system.steps is None or prior is None:
+            return None
+        known = list(system.known.values())
+        positive = [p.uncertainty is not None and p.lower == 0.0 < p.value for p in known]
+        places = torch.zeros(self.size, dtype=torch.bool)
+        places[: len(known)] = torch.tensor(positive, dtype=torch.bool)
+        return Logarithms(places, prior) if any(positive) else None
 
     @property
     def _settled(self) -> frozenset[str]:

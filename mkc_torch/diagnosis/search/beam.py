@@ -18,6 +18,7 @@ from mkc_torch.diagnosis.model.suspect import suspect_id
 from mkc_torch.diagnosis.model.term import Term, run_parallel
 from mkc_torch.diagnosis.score import Score, ScoreBasis, is_implausible, score, separation
 from mkc_torch.diagnosis.search.along_noise import TRIED, add_along_noise
+from mkc_torch.diagnosis.search.at_given_values import add_at_given_values
 from mkc_torch.diagnosis.search.candidate import Candidate, ModelKey, in_order, model_key, place_of, predicts_better
 from mkc_torch.diagnosis.search.in_words import leading
 from mkc_torch.diagnosis.search.move_fits import (
@@ -99,6 +100,7 @@ class BeamSearch:
         self._running = True
         self.keep([Candidate(start, score(start, self.basis, self.settings), "")])
         terms = with_wide_grid(self.terms, start.model.prepared)
+        add_at_given_values(self, start, terms)
         expanded: set[ModelKey] = set()
         held: set[ModelKey] = set()
         most = self.most_models - int(IMPROVING * self.most_models)

@@ -74,7 +74,8 @@ def linear_gains(
     values, counts = fit.pseudo(settings)
     weight = counts / fit.d
     y = (values * weight).flatten()
-    own = torch.linalg.qr((tangents.nuisance * weight.unsqueeze(-1)).flatten(0, 1))[0]
+    nuisance = tangents.nuisance if fit.model.bounds is None else tangents.nuisance[..., _free(fit.model.bounds)]
+    own = torch.linalg.qr((nuisance * weight.unsqueeze(-1)).flatten(0, 1))[0]
     y = y - own @ (own.mT @ y)
     power, samples = float(y.square().sum()), float(counts.sum())
     gains, sizes = [], []
@@ -94,6 +95,11 @@ def linear_gains(
         gains.append(0.5 * samples * math.log(power / max(left, 1e-300)) if better else 0.0)
         sizes.append(within)
     return gains, sizes
+
+
+def _free(bounds: tuple[Tensor, Tensor]) -> Tensor:
+    """Mask of the parameters that are not held."""
+    return bounds[0] < bounds[1]
 
 
 def additions(fit: FittedModel, terms: Sequence[Term], settings: NoiseSettings) -> list[Addition]:

@@ -40,7 +40,9 @@ from mkc_torch.effects.dynamics.position_periodic_force import PositionPeriodicF
 from mkc_torch.effects.dynamics.power_law import PowerLaw
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 from mkc_torch.effects.dynamics.sensor_clock_drift import SensorClockDrift
+from mkc_torch.effects.dynamics.sensor_gain import SensorGain
 from mkc_torch.effects.dynamics.sensor_lag import SensorLag
+from mkc_torch.effects.dynamics.sensor_offset import SensorOffset
 from mkc_torch.effects.dynamics.stribeck_friction import StribeckFriction
 from mkc_torch.effects.dynamics.thermal_loss import ThermalLoss
 from mkc_torch.effects.dynamics.unknown_near_ends import UnknownNearEnds
@@ -94,6 +96,8 @@ DYNAMICS: tuple[Effect, ...] = (
     DriverOutput(),
     DriverOutputQuadratic(),
     DriverOutputLagged(),
+    SensorOffset(),
+    SensorGain(),
     SensorLag(),
     SensorClockDrift(),
     PeriodicRate(),

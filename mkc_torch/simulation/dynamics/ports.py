@@ -136,13 +136,14 @@ class PortContext:
             )
         for name in self.channels:
             unit = self._unit_of(name)
+            parts = {"own": name} if system.steps is None else {"own": name, "stepped": name}
             places[f"output {name}"] = Port(
                 (name,),
                 unit,
                 pointwise=False,
                 kind="single output",
-                parts={"own": name},
-                part_units={"own": unit},
+                parts=parts,
+                part_units=dict.fromkeys(parts, unit),
                 run=self.run,
             )
         parts = {"own": self.channels[0], **{f"output {name}": name for name in self.channels[1:]}}
