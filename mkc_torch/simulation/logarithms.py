@@ -26,16 +26,19 @@ class Logarithms:
     Attributes:
         places: (p,), True where the logarithm is fitted.
         prior: of the parameters, with a positive mean at these places; its relative spread is that of the logarithm.
+        bounds: lower and upper limits of the parameters.
 
     Example:
         >>> prior = GaussianPrior(torch.tensor([8.0, 0.0]), torch.tensor([1.0, 0.0]))
-        >>> logarithms = Logarithms(torch.tensor([True, False]), prior)
+        >>> free = torch.tensor([torch.inf, torch.inf])
+        >>> logarithms = Logarithms(torch.tensor([True, False]), prior, (-free, free))
         >>> logarithms.of(torch.tensor([1.0, 3.0])).tolist(), logarithms.of_prior.precision.tolist()
         ([0.0, 3.0], [64.0, 0.0])
     """
 
     places: Bool[Tensor, " p"]
     prior: GaussianPrior
+    bounds: tuple[Float[Tensor, " p"], Float[Tensor, " p"]]
 
     def of(self, theta: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
         """The coordinates of parameters."""
@@ -65,7 +68,6 @@ class Logarithms:
         start: Float[Tensor, " p"],
         *,
         by: Callable[..., NonlinearFit],
-        bounds: tuple[Float[Tensor, " p"], Float[Tensor, " p"]],
     ) -> NonlinearFit:
         """Fit the coordinates; the result has the parameters.
 
@@ -73,9 +75,8 @@ class Logarithms:
             residual: as a function of the parameters.
             start: the parameters to start from.
             by: fits a residual from a start, with the arguments ``prior``, ``lower`` and ``upper``.
-            bounds: lower and upper limits of the parameters.
         """
-        lower, upper = (self.of(limits) for limits in bounds)
+        lower, upper = (self.of(limits) for limits in self.bounds)
         found = by(_InLogarithms(self, residual), self.of(start), prior=self.of_prior, lower=lower, upper=upper)
         return replace(found, theta=self.parameters(found.theta))
 

@@ -116,7 +116,7 @@ def test_ids_are_unchanged():
     assert (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED) == CATALOGUE
     several = (
         "unknown", "field_gradient", "power_law", "linear_drag", "thermal_loss", "backlash", "delay", "offset",
-        "gravity_sag", "overflow", "driver_rate_constant",
+        "gravity_sag", "overflow", "driver_rate_constant", "gain",
     )  # fmt: skip
     named = [effect.id for effect in CATALOGUE if effect.id not in several]
     assert len(set(named)) == len(named)

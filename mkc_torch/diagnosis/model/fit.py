@@ -223,7 +223,7 @@ def _fit(
         tol=effort.tolerance,
         jacobian=model.prepared.jacobian,
     )
-    by = by if logarithms is None else partial(logarithms.fit, by=by, bounds=model.bounds)
+    by = by if logarithms is None else partial(logarithms.fit, by=by)
     rounds = partial(fitted_in_rounds, fit=by, weight=weight, tolerance=effort.tolerance, rounds=effort.rounds)
     rounds = rounds if logarithms is None else partial(rounds, log_prior=logarithms.log_prior)
     known = rounds(way, start, reference=reference)

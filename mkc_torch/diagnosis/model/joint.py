@@ -69,14 +69,14 @@ class JointModel:
     @property
     def logarithms(self) -> Logarithms | None:
         """Coordinates of a fit of a simulation that steps; None for others, and without positive parameters there."""
-        system, prior = self.prepared.dynamics, self.prior
-        if system is None or system.system.steps is None or prior is None:
+        system, prior, bounds = self.prepared.dynamics, self.prior, self.bounds
+        if system is None or system.system.steps is None or prior is None or bounds is None:
             return None
         known = list(system.known.values())
         positive = [p.uncertainty is not None and p.lower == 0.0 < p.value for p in known]
         places = torch.zeros(self.size, dtype=torch.bool)
         places[: len(known)] = torch.tensor(positive, dtype=torch.bool)
-        return Logarithms(places, prior) if any(positive) else None
+        return Logarithms(places, prior, bounds) if any(positive) else None
 
     @property
     def _settled(self) -> frozenset[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from functools import partial
 
@@ -75,8 +76,10 @@ def _held(fit: FittedModel, away: float) -> FittedModel | None:
     )
     if not far:
         return None
-    given = torch.cat([system.given[: len(system.known)], fit.parameters[len(system.known) :]])
-    return _fitted(JointModel(system.held_at(given)), fit, given)
+    own, (low, high) = system.given[: len(system.known)], system.bounds
+    held = copy.copy(system)
+    held.bounds = torch.cat([own, low[len(own) :]]), torch.cat([own, high[len(own) :]])
+    return _fitted(JointModel(held), fit, torch.cat([own, fit.parameters[len(own) :]]))
 
 
 def _fitted(model: JointModel, like: FittedModel, start: torch.Tensor | None = None) -> FittedModel | None:

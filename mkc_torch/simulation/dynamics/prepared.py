@@ -172,13 +172,6 @@ class PreparedDynamics(CheckedDynamics):
         other.observer = observer
         return other
 
-    def held_at(self, theta: Float[Tensor, " p"]) -> PreparedDynamics:
-        """The simulation with its own parameters held at these values; initial states are still fitted."""
-        other, own = copy.copy(self), len(self.known)
-        low, high = self.bounds
-        other.bounds = torch.cat([theta[:own], low[own:]]), torch.cat([theta[:own], high[own:]])
-        return other
-
     @property
     def dynamics(self) -> PreparedDynamics:
         return self

@@ -68,7 +68,7 @@ def test_effects_on_equations_depend_on_states_inputs_or_columns():
         "driver_output", "driver_output_quadratic", "driver_output_lagged", "input_transport_delay",
     }  # fmt: skip
     for effect in DYNAMICS:
-        assert effect.follows_signal != (effect.id.startswith("driver_output") or effect.by_periodogram)
+        assert effect.follows_signal != (effect.id.startswith(("driver_output", "offset")) or effect.by_periodogram)
         assert all(low > 0.0 for low, _ in effect.fitted_shape.values())
         assert effect.plot_axis in ("", *dynamic_context(effect).parts)
         assert effect.equation.startswith("δ")
@@ -457,7 +457,7 @@ class TestNeeds:
         known = {
             "own", "position", "angle", "deflection", "reversing", "load", "temperature", "level", "other level",
             "other", "rate", "height", "sideways", "flowing", "surroundings",
-            "actuator", "driven",
+            "actuator", "driven", "stepped",
         }  # fmt: skip
         for effect in DYNAMICS:
             assert set(effect.needs) <= known
