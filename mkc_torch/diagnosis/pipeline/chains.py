@@ -24,8 +24,9 @@ def chains_to_test(beam: BeamSearch) -> list[list[Candidate]]:
 
     The simplest good model has the lowest price of those that this recording cannot separate from the highest score,
     and each of its effects raises the score: effects that only gain together have no null in which the first is missing
-    alone. The screening has shown that an effect is missing, so the simulation alone is no rival of models with one
-    effect: those that are more likely are tested if the first chain is refused.
+    alone. Of effects that were chosen together, only all together have to raise it. The screening has shown that an
+    effect is missing, so the simulation alone is no rival of models with one effect: those that are more likely are
+    tested if the first chain is refused.
     """
     alone = beam.models[()]
     least = -math.inf if alone.score is None else alone.score.log_likelihood
@@ -44,9 +45,16 @@ def chains_to_test(beam: BeamSearch) -> list[list[Candidate]]:
     alike = [model for model in good if model.value >= good[0].value - behind]
     for model in [*_by_price(alike, beam.terms), *good[len(alike) :]]:
         chain = chain_to(model, beam)
-        if all(later.value > earlier.value for earlier, later in itertools.pairwise([alone, *chain])):
+        if _raises(chain, alone):
             return [chain, *[other for other in single if other[0].key != chain[0].key]][:_NEXT]
     return single[:_NEXT]
+
+
+def _raises(chain: Sequence[Candidate], alone: Candidate) -> bool:
+    """Whether each effect raises the score, or, of effects that were chosen together, all of them."""
+    if chain[-1].together:
+        return len(chain[0].fit.model.terms) == 1 and chain[-1].value > alone.value
+    return all(later.value > earlier.value for earlier, later in itertools.pairwise([alone, *chain]))
 
 
 def chain_of_line(beam: BeamSearch) -> list[list[Candidate]]:

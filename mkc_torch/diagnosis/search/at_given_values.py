@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -49,7 +50,7 @@ def add_at_given_values(beam: Models, start: FittedModel, terms: Sequence[Term])
             return
         if before.model.terms:
             model = beam.scored("choose effects at the given values", partial(_released, held, start))
-            beam.keep([] if model is None else [model])
+            beam.keep([] if model is None else [replace(model, together=True)])
 
 
 def _worth(fit: FittedModel, beam: Models) -> float:

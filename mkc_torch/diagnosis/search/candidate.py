@@ -26,11 +26,13 @@ class Candidate:
         fit: in open loop, or along the simulation's observer if no open loop is found.
         score: None where the model loses the recording.
         move: how the search came to it.
+        together: whether its effects were chosen together, because none of them is a gain alone.
     """
 
     fit: FittedModel
     score: Score | None
     move: str
+    together: bool = False
 
     @property
     def value(self) -> float:

@@ -17,6 +17,7 @@ from mkc_torch.diagnosis.model.fit import (
     fitted,
     fitted_with_effect,
     with_own_density,
+    within_domain,
     without_term,
 )
 from mkc_torch.diagnosis.model.joint import JointModel
@@ -214,9 +215,10 @@ def _begun(fit: FittedModel, term: Term, size: torch.Tensor) -> FittedModel:
 
 
 def fitted_without(fit: FittedModel, number: int) -> FittedModel | None:
-    start = without_term(fit, number)
     try:
-        return shape_fitted(fitted(start.model, start.parameters, fit.bound, graduate=False, effort=SEARCH), SEARCH)
+        # an effect that explains nearly all leaves a residual that the domain of the fit with it cannot hold
+        start = within_domain(without_term(fit, number))
+        return shape_fitted(fitted(start.model, start.parameters, start.bound, graduate=False, effort=SEARCH), SEARCH)
     except NoFitError:
         return None
 

@@ -76,7 +76,7 @@ def changes_by_inputs(prepared: Observable, theta: Float[Tensor, " p"]) -> Float
     held = now._replace(inputs=now.inputs.median(0).values.expand_as(now.inputs))
     own, without = (free.rate(theta, {}, acting)(at) for acting in (now, held))
     places = [free.system.states.index(name) for name in free.disturbable]
-    moved = (own - without)[:, places].detach().abs().nan_to_num(0.0, 0.0)
+    moved = (own - without)[:: free.grid.per_interval, places].detach().abs().nan_to_num(0.0, 0.0)
     changes: np.ndarray = torch.quantile(moved, _RATE_QUANTILE, 0).double().cpu().numpy()
     return changes
 
