@@ -81,8 +81,10 @@ class Logarithms:
         return replace(found, theta=self.parameters(found.theta))
 
 
-def log_density(prior: GaussianPrior, theta: Float[Tensor, " p"]) -> float:
-    """The logarithm of a Gaussian prior's density, up to its constant."""
+def log_density(prior: GaussianPrior | None, theta: Float[Tensor, " p"]) -> float:
+    """The logarithm of a Gaussian prior's density, up to its constant; 0 without a prior."""
+    if prior is None:
+        return 0.0
     away = theta - prior.mean
     precise = prior.precision * away if prior.precision.ndim == 1 else prior.precision @ away
     return -0.5 * float(away @ precise)
