@@ -25,7 +25,7 @@ from mkc_torch.effects.paired.between import shifted
 from mkc_torch.effects.per_recording import selected_size
 from mkc_torch.effects.sensor import ATTITUDE, SENSOR
 from mkc_torch.effects.share import soft_clip
-from mkc_torch.effects.waveforms import lagged, played
+from mkc_torch.effects.waveforms import lagged, played, rate_limited
 
 __all__ = [
     "ATTITUDE",
@@ -51,6 +51,7 @@ __all__ = [
     "kind_of",
     "lagged",
     "played",
+    "rate_limited",
     "resampled",
     "selected_size",
     "shifted",

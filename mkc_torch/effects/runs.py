@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -121,3 +123,47 @@ def clamped_recurrence(low: Float[Tensor, " N"], high: Float[Tensor, " N"]) -> F
         low, high = torch.cat([low[:shift], tail_low]), torch.cat([high[:shift], tail_high])
         shift *= 2
     return low
+
+
+def limited_recurrence(values: Float[Tensor, " N"], reach: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """The recurrence ``y[k] = y[k-1] + max(-reach[k], min(reach[k], values[k] - y[k-1]))``, without derivatives.
+
+    It restarts where ``reach`` is infinite, as must be the case at the first sample.
+
+    Example:
+        >>> limited_recurrence(torch.tensor([0.0, 3.0, 3.0, 0.0]), torch.tensor([torch.inf, 2.0, 2.0, 2.0]))
+        tensor([0., 2., 3., 1.])
+    """
+    found: Tensor = _LimitedRecurrence.apply(values, reach)  # type: ignore[no-untyped-call]
+    return found
+
+
+class _LimitedRecurrence(torch.autograd.Function):
+    """:func:`limited_recurrence` along the last dimension, with a rule for ``vmap``."""
+
+    @staticmethod
+    def forward(values: Tensor, reach: Tensor) -> Tensor:
+        rows = torch.broadcast_tensors(values, reach)
+        # such maps do not compose to one of their kind, so there is no parallel scan
+        found = [
+            _limited(*pair) for pair in zip(*(row.reshape(-1, row.shape[-1]).tolist() for row in rows), strict=True)
+        ]
+        return values.new_tensor(found).reshape(rows[0].shape)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.mark_non_differentiable(output)
+
+    @staticmethod
+    def vmap(_info: Any, places: tuple[int | None, int | None], *tables: Tensor) -> tuple[Tensor, int]:
+        rows = [table if at is None else table.movedim(at, 0) for table, at in zip(tables, places, strict=True)]
+        return limited_recurrence(rows[0], rows[1]), 0
+
+
+def _limited(values: Sequence[float], reach: Sequence[float]) -> list[float]:
+    followed, found = 0.0, []
+    for value, far in zip(values, reach, strict=True):
+        away = value - followed
+        followed = value if -far <= away <= far else followed + math.copysign(far, away)
+        found.append(followed)
+    return found

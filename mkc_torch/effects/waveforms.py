@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.effects.runs import clamped_recurrence, first_of_runs, linear_recurrence, run_numbers
+from mkc_torch.effects.runs import clamped_recurrence, first_of_runs, limited_recurrence, linear_recurrence, run_numbers
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -95,6 +95,37 @@ def played(
     gap = torch.where(first, torch.zeros_like(values), half_gap)
     touched, side = in_contact(values.detach(), gap.detach())
     return values[touched] + side * gap
+
+
+def rate_limited(
+    values: Float[Tensor, " N"],
+    time: Float[Tensor, " N"],
+    rate: float | Tensor,
+    run: Int[Tensor, " N"] | None = None,
+) -> Float[Tensor, " N"]:
+    """Values that are followed no faster than at a rate, from the first sample of each run.
+
+    Args:
+        values: values of the command at the samples.
+        time: times of the samples in s.
+        rate: fastest change, in the values' unit per s; above 0.
+        run: number of each sample's run; None: a run begins only where time goes back.
+
+    Example:
+        >>> step = torch.tensor([0.0, 3.0, 3.0, 3.0, 0.0])
+        >>> rate_limited(step, torch.arange(5.0), 2.0)
+        tensor([0., 2., 3., 3., 1.])
+    """
+    first = first_of_runs(run_numbers(time) if run is None else run)
+    step = torch.cat([time.new_zeros(1), time.diff()]).clamp(min=0.0)
+    reach = torch.where(first, torch.inf, rate * step).to(values.dtype)
+    followed = limited_recurrence(values.detach(), reach.detach())
+    # differentiable in the values and the rate, without differentiating through the recursion
+    reached = followed == values.detach()
+    number = torch.arange(len(values), device=values.device)
+    touched = torch.where(reached, number, torch.zeros_like(number)).cummax(0).values
+    signed = torch.where(reached, 0.0, torch.sign(values.detach() - followed) * step)
+    return values[touched] + rate * linear_recurrence((~reached).to(values.dtype), signed)
 
 
 def in_contact(values: Float[Tensor, " N"], gap: Float[Tensor, " N"]) -> tuple[Int[Tensor, " N"], Float[Tensor, " N"]]:

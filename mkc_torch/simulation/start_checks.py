@@ -55,7 +55,7 @@ class StartCheck:
         kind: "no equation", a parameter that no rate and no output uses; "no output", a parameter that changes no
             output in this recording; "only together", parameters of which only a combination is determined;
             "at a bound", a start value at a bound, from which a fit can stall; "impossible value", a value of the fit
-            without effects that cannot be.
+            without effects that cannot be; "unlikely value", a value of that fit far from the value given.
         parameters: their names.
         sentence: for the user.
         combination: the determined combination, such as ``gain * inertia``; empty for other kinds.
@@ -64,7 +64,7 @@ class StartCheck:
             kinds.
     """
 
-    kind: Literal["no equation", "no output", "only together", "at a bound", "impossible value"]
+    kind: Literal["no equation", "no output", "only together", "at a bound", "impossible value", "unlikely value"]
     parameters: tuple[str, ...]
     sentence: str
     combination: str = ""

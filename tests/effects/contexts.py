@@ -38,7 +38,7 @@ def dynamic_context(effect, N=80, driven=False):
     if driven or needs_driver(effect):
         drivers, driver_units, means = torch.cos(3.0 * time).unsqueeze(-1), UNITS[effect.roles[0]], (2.0,)
     if effect.port in ("input", "output", "single output"):
-        parts, units = {"own": "force"}, {"own": "N"}
+        parts, units = {"own": "force", "pace": "force"}, {"own": "N", "pace": "N/s"}
         signal = oscillating(N, 1)
         return Context(time, drivers, driver_units, signal, "N", ("force",), (), parts, units, None, means)
     if effect.port == "parameter":

@@ -10,7 +10,18 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.effects import Effect, beyond, curve_within, lagged, played, resampled, shifted, soft_clip, travelled
+from mkc_torch.effects import (
+    Effect,
+    beyond,
+    curve_within,
+    lagged,
+    played,
+    rate_limited,
+    resampled,
+    shifted,
+    soft_clip,
+    travelled,
+)
 from mkc_torch.effects.kinds import absolute_zero
 from mkc_torch.effects.waveforms import outer_product
 from mkc_torch.simulation.dynamics.ports import memory_at
@@ -288,7 +299,12 @@ class OfEveryShape:
         known = {"x": x, "torch": torch, "time": context.time, "run": context.runs}
         known |= {"d": context.recorded} if context.units else {}
         known |= {"lagged": lagged, "shifted": shifted, "played": played, "soft_clip": soft_clip, "beyond": beyond}
-        known |= {"curve_within": curve_within, "travelled": travelled, "resampled": resampled}
+        known |= {
+            "rate_limited": rate_limited,
+            "curve_within": curve_within,
+            "travelled": travelled,
+            "resampled": resampled,
+        }
         shape = {name: float(value) for name, value in shape.items()}
         lines = effect.code(gamma.tolist(), shape, names)
         written = torch.stack([eval(line, known) + torch.zeros_like(context.time) for line in lines], -1)

@@ -112,6 +112,7 @@ def test_ids_are_unchanged():
         "driver_force", "driver_exchange", "driver_rate_constant", "driver_input_gain",
         "driver_parameter", "driver_parameter_quadratic", "driver_parameter_arrhenius", "constant_change",
         "driver_output", "driver_output_quadratic", "driver_output_lagged", "periodic_rate", "periodic_output",
+        "input_rate_limit",
     }  # fmt: skip
     assert (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED) == CATALOGUE
     several = (

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from mkc_torch.effects.hysteresis import hysteretic_path
 from mkc_torch.effects.paired.between import shifted
 from mkc_torch.effects.runs import clamped_recurrence, linear_recurrence
-from mkc_torch.effects.waveforms import lagged, played
+from mkc_torch.effects.waveforms import lagged, played, rate_limited
 
 RANDOM = np.random.default_rng(11)
 TIME = torch.arange(60, dtype=torch.float64)
@@ -83,11 +83,39 @@ def test_play_without_a_gap_changes_nothing():
     assert torch.equal(played(u, torch.arange(20.0), 0.0), u)
 
 
-@pytest.mark.parametrize("of", ["play", "hysteresis", "lag", "shift"])
+def test_rate_limited_equals_the_limited_equation():
+    """ẏ = ±r until y has reached its command, whatever the sampling intervals."""
+    time = np.cumsum(RANDOM.uniform(0.001, 0.01, 800))
+    u, rate = np.sin(3.0 * time) + 0.5 * np.sin(7.0 * time), 2.5
+    fine = np.linspace(time[0], time[-1], 200_001)
+    command, y = np.interp(fine, time, u), u[0]
+    followed = []
+    for value in command:
+        y += np.clip(value - y, -rate * (fine[1] - fine[0]), rate * (fine[1] - fine[0]))
+        followed.append(y)
+    found = rate_limited(torch.from_numpy(u), torch.from_numpy(time), rate).numpy()
+    exact = np.interp(time, fine, followed)
+    assert 0.2 < np.mean(np.abs(exact - u) > 1e-2) < 0.8
+    np.testing.assert_allclose(found, exact, rtol=0, atol=0.01)  # it meets its command between two samples
+
+
+def test_a_limit_beyond_the_fastest_change_has_no_effect():
+    u = torch.from_numpy(RANDOM.standard_normal(20))
+    assert torch.equal(rate_limited(u, torch.arange(20.0), 10.0), u)
+
+
+def test_the_largest_rate_is_differentiable():
+    u = torch.from_numpy(RANDOM.standard_normal(20).cumsum())
+    rate = torch.tensor(0.37, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda r: rate_limited(u, TIME[:20], r), (rate,), check_forward_ad=True)
+
+
+@pytest.mark.parametrize("of", ["play", "rate limit", "hysteresis", "lag", "shift"])
 def test_derivatives_in_all_modes(of):
     """In reverse and forward mode, and under vmap."""
     function = {
         "play": lambda v: played(v, TIME[:12], 0.7),
+        "rate limit": lambda v: rate_limited(v, TIME[:12], 0.4),
         "hysteresis": lambda v: hysteretic_path(v, 0.7, torch.zeros(12, dtype=torch.long)),
         "lag": lambda v: lagged(v, TIME[:12], 3.0),
         "shift": lambda v: shifted(v, TIME[:12], -2.3),
@@ -129,6 +157,7 @@ def test_runs_are_separated_by_their_numbers():
     run = torch.arange(3).repeat_interleave(20)
     for function in (
         lambda v, t, r: played(v, t, 0.5, r),
+        lambda v, t, r: rate_limited(v, t, 0.2, r),
         lambda v, t, r: lagged(v, t, 4.0, r),
         lambda v, t, r: shifted(v, t, -3.7, r),
         lambda v, t, r: shifted(v, t, 3.7, r),

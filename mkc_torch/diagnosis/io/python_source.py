@@ -32,6 +32,7 @@ _DIGITS = 9
 _FROM_HERE: Mapping[str, str] = {
     "lagged(": "from mkc_torch.effects import lagged",
     "played(": "from mkc_torch.effects import played",
+    "rate_limited(": "from mkc_torch.effects import rate_limited",
     "resampled(": "from mkc_torch.effects import resampled",
     "shifted(": "from mkc_torch.effects import shifted",
     "soft_clip(": "from mkc_torch.effects import soft_clip",

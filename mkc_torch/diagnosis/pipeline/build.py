@@ -54,6 +54,7 @@ from mkc_torch.nonlinear import NoFitError
 from mkc_torch.recording.unit_warnings import unit_warnings
 from mkc_torch.simulation.dynamics.impossible import impossible_checks, impossible_values
 from mkc_torch.simulation.dynamics.noise import sized_noise
+from mkc_torch.simulation.dynamics.unlikely import unlikely_checks
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 from mkc_torch.simulation.start_checks import StartCheck
 
@@ -343,12 +344,15 @@ def _unchecked_warnings(prepared: PreparedSimulation) -> list[str]:
 
 
 def _impossible(whole: DiagnosisInputs) -> tuple[StartCheck, ...]:
-    """Return the values of the fit without effects that cannot be."""
+    """Return the values of the fit without effects that cannot be, or that are far from those given."""
     fit = whole.base.fit if whole.base.free is None else whole.base.free
     prepared = fit.model.prepared.dynamics
     if prepared is None:
         return ()
-    return impossible_checks(prepared, impossible_values(prepared, fit.parameters))
+    found = impossible_checks(prepared, impossible_values(prepared, fit.parameters))
+    named = {name for check in found for name in check.parameters}
+    unlikely = unlikely_checks(prepared, fit.parameters, whole.final.parameters)
+    return (*found, *(check for check in unlikely if named.isdisjoint(check.parameters)))
 
 
 def _assessment(whole: DiagnosisInputs) -> FitAssessment:

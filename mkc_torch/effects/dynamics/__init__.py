@@ -28,6 +28,7 @@ from mkc_torch.effects.dynamics.hidden_lag import HiddenLag
 from mkc_torch.effects.dynamics.hidden_mode import HiddenMode
 from mkc_torch.effects.dynamics.input_delay import InputDelay
 from mkc_torch.effects.dynamics.input_lag import InputLag
+from mkc_torch.effects.dynamics.input_rate_limit import InputRateLimit
 from mkc_torch.effects.dynamics.input_saturation import InputSaturation
 from mkc_torch.effects.dynamics.input_square import InputSquare
 from mkc_torch.effects.dynamics.input_transport_delay import InputTransportDelay
@@ -87,6 +88,7 @@ DYNAMICS: tuple[Effect, ...] = (
     InputLag(),
     InputSquare(),
     InputSaturation(),
+    InputRateLimit(),
     DeadZone(),
     DriverInputGain(),
     DriverParameter(),

@@ -16,6 +16,7 @@ _LABELS = {
     "only together": "not separable",
     "at a bound": "start at a bound",
     "impossible value": "fitted value",
+    "unlikely value": "fitted value",
 }
 
 

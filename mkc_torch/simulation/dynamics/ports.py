@@ -97,14 +97,16 @@ class PortContext:
             places[f"exchange of {first} and {second}"] = replace(port, channels=(first, second))
         for name in (name for name in system.inputs if name not in without):
             actuator = {} if name in self._surroundings.values() else {"actuator": name}
+            pace = self._pace_of(name)
+            changing = {"pace": name} if pace.largest > 0.0 else {}
             places[f"input {name}"] = Port(
                 (name,),
                 self._unit_of(name),
                 pointwise=False,
                 kind="input",
-                parts={"own": name, **actuator},
-                part_units={"own": self._unit_of(name)},
-                sizes={"own": SignalSizes.of(self.recording[name])},
+                parts={"own": name, **changing, **actuator},
+                part_units={"own": self._unit_of(name), "pace": per_second(self._unit_of(name))},
+                sizes={"own": SignalSizes.of(self.recording[name]), "pace": pace},
                 clock=self.clock,
                 run=self.run[self.clock.before],
             )
@@ -207,7 +209,7 @@ class PortContext:
         unit = self._unit_of(state)
         return Port(
             (state,),
-            f"{unit}/s" if unit else "1/s",
+            per_second(unit),
             pointwise=False,
             kind=kind,
             carries=(*self.system.states, *self.system.inputs, *(parts[of] for of in ("load", "rate") if of in parts)),
@@ -230,6 +232,13 @@ class PortContext:
             sizes["surroundings"] = SignalSizes.of(values[state] - self.recording[parts["surroundings"]])
         return sizes
 
+    def _pace_of(self, name: str) -> SignalSizes:
+        """Sizes of the change per s of an input."""
+        step = self.recording["time"].diff()
+        within = (self.run.diff() == 0) & (step > 0.0)
+        change = self.recording[name].diff()[within] / step[within]
+        return SignalSizes.of(change) if len(change) else SignalSizes.of(step.new_zeros(1))
+
     def _unit_of(self, name: str) -> str:
         return self.system.units.get(name, self.recording.units[name] if name in self.recording else "")
 
@@ -242,6 +251,16 @@ def memory_at(kind: str, state: str) -> dict[str, str]:
         ({'deflection_of_speed': '', 'hidden_speed': 'speed'}, {})
     """
     return {f"{name}_{state}": state if alike else "" for name, alike in _MEMORIES.get(kind, {}).items()}
+
+
+def per_second(unit: str) -> str:
+    """The unit of a rate.
+
+    Example:
+        >>> per_second("rad"), per_second("")
+        ('rad/s', '1/s')
+    """
+    return f"{unit}/s" if unit else "1/s"
 
 
 def common_unit(units: Iterable[str]) -> str:

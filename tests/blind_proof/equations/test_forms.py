@@ -60,6 +60,7 @@ NEVER_HIDDEN = {
     "added_mass": "every plant's own parameters scale all its forces, or there is none but gravity",
     "buoyancy": "no plant has a height of either sign",
     "gain": "the joint's scale is fitted",
+    "input_rate_limit": "no plant has an actuator of its own speed; `tests.diagnosis.test_rate_limit` hides it",
     "constant_change": "no plant steps; `tests.simulation.stepped.test_constants` hides it",
     "clock_drift": "no plant has a clock of its own",
     "sensor_clock_drift": "as for clocks of paired data; `tests.diagnosis.test_clocks` hides it",

@@ -26,6 +26,7 @@ LOSSES = ("linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_frictio
 EITHER_SIGN = ("constant_force", "cubic_stiffness", "position_periodic_force", "magnus_lift", "power_law")
 SHARES = (
     "input_delay", "input_lag", "input_square", "input_saturation", "dead_zone", "sensor_lag", "backlash", "added_mass",
+    "input_rate_limit",
 )  # fmt: skip
 
 N = 80
@@ -212,7 +213,7 @@ def test_a_delay_does_not_reach_into_another_run():
     torch.testing.assert_close(delayed[40:], 1.0 + (time[40:] - 0.3).clamp(min=0.0))
 
 
-@pytest.mark.parametrize("name", ["input_delay", "input_lag", "sensor_lag", "backlash"])
+@pytest.mark.parametrize("name", ["input_delay", "input_lag", "sensor_lag", "backlash", "input_rate_limit"])
 def test_runs_are_separated_by_their_number_for_any_clock(name):
     """On a common clock, and on separate clocks, the memory of a run ends with the run."""
     effect = EFFECT_BY_ID[name]
@@ -369,7 +370,7 @@ class TestNeeds:
         places = effects_by_port(prepared(Motor, angle=torch.cos(3.0 * TIME), torque=torch.sin(TIME)))
         assert "load_dependent_friction" in set().union(*places.values())
         assert places["input torque"] == {
-            "input_delay", "input_lag", "input_square", "input_saturation", "dead_zone", "backlash",
+            "input_delay", "input_lag", "input_square", "input_saturation", "dead_zone", "backlash", "input_rate_limit",
         }  # fmt: skip
 
     def test_friction_and_hysteresis_are_not_tried_on_a_fall_without_reversal(self):
@@ -457,7 +458,7 @@ class TestNeeds:
         known = {
             "own", "position", "angle", "deflection", "reversing", "load", "temperature", "level", "other level",
             "other", "rate", "height", "sideways", "flowing", "surroundings",
-            "actuator", "driven", "stepped",
+            "actuator", "driven", "stepped", "pace",
         }  # fmt: skip
         for effect in DYNAMICS:
             assert set(effect.needs) <= known

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 _AXES = ("x", "y")
 """Horizontal axes of the base."""
 
+_LENGTH = 2.0
+"""Largest factor by which a link's length differs from the file: a longer link would only imitate inertia."""
+
 
 @dataclass(frozen=True)
 class Constant:
@@ -93,7 +96,8 @@ def constants_of(
             mass = Parameter(float(model.body_mass[k]), lower=0.0, unit="kg")
             found[f"{bodies[k]}_mass"] = Constant("mass", k, mass)
         if model.body_dofnum[k] and moves[model.body_parentid[k]] and away > 0.0:
-            found[f"{bodies[k]}_distance"] = Constant("distance", k, Parameter(away, lower=0.0, unit="m"))
+            length = Parameter(away, lower=away / _LENGTH, upper=away * _LENGTH, unit="m")
+            found[f"{bodies[k]}_distance"] = Constant("distance", k, length)
     if model.opt.gravity.any():
         found |= {f"base_tilt_{axis}": Constant("tilt", k, Parameter(0.0, unit="rad")) for k, axis in enumerate(_AXES)}
     for k, joint in enumerate(joints):
