@@ -55,7 +55,8 @@ class StartCheck:
         kind: "no equation", a parameter that no rate and no output uses; "no output", a parameter that changes no
             output in this recording; "only together", parameters of which only a combination is determined;
             "at a bound", a start value at a bound, from which a fit can stall; "impossible value", a value of the fit
-            without effects that cannot be; "unlikely value", a value of that fit far from the value given.
+            without effects that cannot be; "unlikely value", a value of that fit far from the value given;
+            "diverges", an output that is not finite with the given values.
         parameters: their names.
         sentence: for the user.
         combination: the determined combination, such as ``gain * inertia``; empty for other kinds.
@@ -64,7 +65,9 @@ class StartCheck:
             kinds.
     """
 
-    kind: Literal["no equation", "no output", "only together", "at a bound", "impossible value", "unlikely value"]
+    kind: Literal[
+        "no equation", "no output", "only together", "at a bound", "impossible value", "unlikely value", "diverges"
+    ]
     parameters: tuple[str, ...]
     sentence: str
     combination: str = ""

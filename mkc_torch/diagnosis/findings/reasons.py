@@ -122,9 +122,12 @@ def _of_trials(prepared: PreparedDynamics, fits: Sequence[FittedModel], follows:
     if sentences:
         # an input can matter with the other sign only
         return sentences[:3]
+    steps = prepared.system.steps
+    of_effects = () if steps is None else (*steps.forces, *steps.constants)
     still = [
         (name, _size(_with_inputs(prepared, _still(prepared, number)), fits)[0])
         for number, name in enumerate(prepared.system.inputs)
+        if name not in of_effects
     ]
     known = [output.output for output in follows]
     for name, size in still:

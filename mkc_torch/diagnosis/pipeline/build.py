@@ -52,6 +52,7 @@ from mkc_torch.diagnosis.verdict import (
 from mkc_torch.diagnosis.vetoes import VetoContext, counts, decisions_on, grade, is_dropped, is_zero_within_error
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.recording.unit_warnings import unit_warnings
+from mkc_torch.simulation.dynamics.diverging import divergence_checks
 from mkc_torch.simulation.dynamics.impossible import impossible_checks, impossible_values
 from mkc_torch.simulation.dynamics.noise import sized_noise
 from mkc_torch.simulation.dynamics.unlikely import unlikely_checks
@@ -203,7 +204,7 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
         separability=separability(first) if first else _nothing_to_separate(),
         traces=traces_of(case, whole.drivers, corrected),
         model=_model(whole, corrected.exported),
-        checks=(*prepared.checks, *_impossible(whole)),
+        checks=(*prepared.checks, *_checks_of_fit(whole)),
         evidence=answers.of_all,
         environment=_environment(whole, known, unfit=unfit),
         quick=options.quick,
@@ -343,8 +344,8 @@ def _unchecked_warnings(prepared: PreparedSimulation) -> list[str]:
     return [warning for warning in prepared.warnings if not any(name in warning for name in named)]
 
 
-def _impossible(whole: DiagnosisInputs) -> tuple[StartCheck, ...]:
-    """Return the values of the fit without effects that cannot be, or that are far from those given."""
+def _checks_of_fit(whole: DiagnosisInputs) -> tuple[StartCheck, ...]:
+    """Return the values of the fit without effects that cannot be or are far from those given, and a divergence."""
     fit = whole.base.fit if whole.base.free is None else whole.base.free
     prepared = fit.model.prepared.dynamics
     if prepared is None:
@@ -352,7 +353,8 @@ def _impossible(whole: DiagnosisInputs) -> tuple[StartCheck, ...]:
     found = impossible_checks(prepared, impossible_values(prepared, fit.parameters))
     named = {name for check in found for name in check.parameters}
     unlikely = unlikely_checks(prepared, fit.parameters, whole.final.parameters)
-    return (*found, *(check for check in unlikely if named.isdisjoint(check.parameters)))
+    diverging = optional("checking the given values", partial(divergence_checks, prepared), lambda: ())
+    return (*diverging, *found, *(check for check in unlikely if named.isdisjoint(check.parameters)))
 
 
 def _assessment(whole: DiagnosisInputs) -> FitAssessment:

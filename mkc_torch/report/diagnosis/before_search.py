@@ -17,6 +17,7 @@ _LABELS = {
     "at a bound": "start at a bound",
     "impossible value": "fitted value",
     "unlikely value": "fitted value",
+    "diverges": "diverges",
 }
 
 

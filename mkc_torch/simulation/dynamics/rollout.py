@@ -71,16 +71,23 @@ def plain_steps(
     prepared: Stepping, theta: Float[Tensor, " p"], changes: Changes, begin: Float[Tensor, "K w"]
 ) -> Float[Tensor, "G w"] | None:
     """Return the states by plain steps, as in :func:`rolled_out`; None where the simulation or a state fails."""
+    found = free_steps(prepared, theta, changes, begin)
+    return found if found is not None and bool(found.isfinite().all()) else None
+
+
+def free_steps(
+    prepared: Stepping, theta: Float[Tensor, " p"], changes: Changes, begin: Float[Tensor, "K w"]
+) -> Float[Tensor, "G w"] | None:
+    """Return the states by plain steps, NaN from a step that fails on; None where there are no such steps."""
     system, now = prepared.system, prepared.acting(theta, changes)
     if system.steps is None or begin.shape[1] > len(system.states):  # internal states of effects have no step
         return None
     names = enumerate(system.inputs)
     entering = {k: changes[f"entry of {name}"] for k, name in names if f"entry of {name}" in changes}
     rollout = system.steps.rollout
-    found = stepped(
+    return stepped(
         lambda state, inputs: rollout(state, inputs, now.parameters), prepared.grid, begin, now.inputs, entering
     )
-    return found if bool(found.isfinite().all()) else None
 
 
 def stepped(

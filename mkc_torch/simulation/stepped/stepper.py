@@ -202,7 +202,9 @@ class Stepper(Dynamics):
         if changed is None:
             return inputs.new_full((len(given), len(x)), torch.nan)
         named = Names(**known, **changed)
-        return torch.from_numpy(self.rollout(x, given[:, :m], given[:, forces], named, self.time_step)).to(state)
+        with np.errstate(over="ignore", invalid="ignore"):  # where the simulation diverges
+            found = self.rollout(x, given[:, :m], given[:, forces], named, self.time_step)
+        return torch.from_numpy(found).to(state)
 
     def _evaluated(self, outputs: bool, time: Tensor, x: Any, u: Any, p: Any) -> Tensor:
         evaluation, given = self._evaluation, vars(u)

@@ -21,25 +21,28 @@ def two_links(tmp_path):
     return tmp_path / "two_links.xml"
 
 
-def recorded(path, rows=80, sample=0.02, friction=0.0, seed=0):
-    """A recording of both joints, stepped by MuJoCo itself."""
+def recorded(path, rows=80, sample=0.02, friction=0.0, seed=0, torque=False):
+    """A recording of both joints, stepped by MuJoCo itself; with ``torque`` also of the shoulder's drive."""
     spec = mujoco.MjSpec.from_file(str(path))
     spec.joints[1].frictionloss += friction
     model = spec.compile()
     data = mujoco.MjData(model)
     rng = np.random.default_rng(seed)
     controls = np.repeat(rng.normal(size=(rows // 10 + 1, 2)), 10, 0)[:rows] * [0.6, 0.8]
-    angles = []
+    angles, torques = [], []
     for control in controls:
         angles.append(data.qpos.copy())
         data.ctrl[:] = control
+        mujoco.mj_forward(model, data)
+        torques.append(data.qfrc_actuator[0])
         for _ in range(round(sample / model.opt.timestep)):
             data.qacc_warmstart[:] = 0.0
             mujoco.mj_step(model, data)
     time = sample * torch.arange(rows, dtype=torch.float64)
     names = ("shoulder_ctrl", "elbow_motor", "shoulder", "elbow")
     columns = np.concatenate([controls, np.array(angles)], 1)
-    return Recording({"time": time, **dict(zip(names, torch.tensor(columns).unbind(-1), strict=True))})
+    more = {"shoulder_torque": torch.tensor(torques)} if torque else {}
+    return Recording({"time": time, **dict(zip(names, torch.tensor(columns).unbind(-1), strict=True)), **more})
 
 
 def test_names_units_and_numbers_are_those_of_the_file(two_links):
@@ -105,6 +108,30 @@ def test_sensors_are_outputs(tmp_path):
     theta = prepared.given
     states = prepared.trajectory(theta, {}).states[prepared.rows]
     torch.testing.assert_close(prepared.simulated(theta, {})[:, 0], states[:, 0], atol=1e-12, rtol=0)
+
+
+def test_the_measured_torque_of_a_drive_is_an_output(two_links):
+    prepared = load_mjcf(two_links).prepare(recorded(two_links, torque=True))
+    assert prepared.channels == ("shoulder", "elbow", "shoulder_torque")
+    assert prepared.system.units["shoulder_torque"] == "N m"
+    theta = prepared.given
+    theta[-2:] = 0.0
+    assert float(prepared.measured[:, 2].std()) > 0.1
+    assert prepared.residual(theta, {}).abs().max() < 1e-8
+
+
+def test_the_torque_of_a_joint_that_follows_is_no_output(two_links):
+    assert set(load_mjcf(two_links).description.sensors) >= {"shoulder_torque", "elbow_torque"}
+    assert "shoulder_torque" not in load_mjcf(two_links, joints=["elbow"]).description.sensors
+
+
+def test_a_sensor_of_the_name_of_a_torque_stays_the_users(tmp_path):
+    text = PENDULUM.replace("<sensor>", '<sensor><jointvel name="hinge_torque" joint="hinge"/>')
+    assert text != PENDULUM
+    (tmp_path / "pendulum.xml").write_text(text)
+    description = load_mjcf(tmp_path / "pendulum.xml").description
+    assert "hinge_torque" in description.sensors
+    assert "hinge_torque" not in description.units
 
 
 def test_the_simulation_survives_pickling_with_its_forces(two_links):

@@ -90,6 +90,7 @@ def described(path: Path, fitted: Sequence[str] | None) -> Description:
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         drop_visuals(spec)
+        drives = _sense_drives(spec)
         model = spec.compile()
     except ValueError as error:
         raise MjcfError(f"{path}: MuJoCo refuses the model: {error}") from None
@@ -122,6 +123,7 @@ def described(path: Path, fitted: Sequence[str] | None) -> Description:
     for k, name in enumerate(controls):
         if (unit := _unit_of_control(model, k, units, joints)) is not None:
             units[name] = unit
+    units |= {_identifier(name): "N m" if hinge else "N" for name, hinge in drives.items()}
     numbers = numbers_of(model, joints, hinges, actuators, fitted)
     bodies = [_identifier(_name(model, mujoco.mjtObj.mjOBJ_BODY, k) or f"body{k}") for k in range(model.nbody)]
     first = mujoco.MjData(model)
@@ -156,6 +158,20 @@ def the_library() -> Any:
             "Models of MuJoCo need the extra `mujoco`: pip install -e '.[mujoco]' in the repository's folder."
         ) from error
     return mujoco
+
+
+def _sense_drives(spec: Any) -> dict[str, bool]:
+    """Add a sensor of the actuators' force at each named joint; name of the sensor to whether the joint is a hinge."""
+    mujoco = the_library()
+    taken, found = {sensor.name for sensor in spec.sensors}, {}
+    for joint in list(spec.joints):
+        hinge = joint.type == mujoco.mjtJoint.mjJNT_HINGE
+        name = f"{joint.name}_torque" if hinge else f"{joint.name}_effort"
+        if joint.name and name not in taken and (hinge or joint.type == mujoco.mjtJoint.mjJNT_SLIDE):
+            of = {"objtype": mujoco.mjtObj.mjOBJ_JOINT, "objname": joint.name}
+            spec.add_sensor(name=name, type=mujoco.mjtSensor.mjSENS_JOINTACTFRC, **of)
+            found[name] = hinge
+    return found
 
 
 def _name(model: Any, kind: Any, number: int) -> str | None:
