@@ -16,6 +16,9 @@ _BASE = {f"{prefix}{name}": (size, name) for name in "TAVmsK" for prefix, size i
 _BASE |= {"°C": (1.0, "K"), "G": (1e-4, "T"), "mG": (1e-7, "T"), "gauss": (1e-4, "T"), "°": (1.0, "°")}
 """Units with their factors to base units, and these base units."""
 
+_SYMBOLS = {*"NmsgAVWJKCFHTΩ", "kg", "rad", "Pa", "Hz", "mm", "cm", "°C"}
+"""Symbols between which a space stands for a product."""
+
 _PLAIN = -3, 6
 """Powers of ten between which a number has no exponent."""
 
@@ -69,11 +72,11 @@ def tidy(unit: str) -> str:
     """A unit with each factor once; unchanged if it is not a product of powers.
 
     Example:
-        >>> tidy("rad/s/s"), tidy("m/(s·kg)"), tidy("1/s"), tidy("°C"), tidy("")
-        ('rad/s²', 'm/(s·kg)', '1/s', '°C', '')
+        >>> tidy("rad/s/s"), tidy("m/(s·kg)"), tidy("1/s"), tidy("°C"), tidy(""), tidy("N m s/rad")
+        ('rad/s²', 'm/(s·kg)', '1/s', '°C', '', 'N m s/rad')
     """
     factors = _factors(unit)
-    return unit if factors is None else _written(factors)
+    return unit if factors is None else _written(factors, _product_sign(unit))
 
 
 def quotient(unit: str, other: str, power: int = 1) -> str:
@@ -82,14 +85,15 @@ def quotient(unit: str, other: str, power: int = 1) -> str:
     Example:
         >>> quotient("rad/s²", "rad/s", 2), quotient("rad/s²", "rad/s"), quotient("m/s²", "m/s", 2)
         ('1/rad', '1/s', '1/m')
-        >>> quotient("W", "°C", 2)
-        'W/K²'
+        >>> quotient("W", "°C", 2), quotient("N m", "rad/s")
+        ('W/K²', 'N m s/rad')
     """
     other = "K" if other == "°C" else other
     above, below = _factors(unit), _factors(other)
     if not unit or not other or above is None or below is None:
         return ""
-    return _written({name: above.get(name, 0) - power * below.get(name, 0) for name in {**above, **below}})
+    powers = {name: above.get(name, 0) - power * below.get(name, 0) for name in {**above, **below}}
+    return _written(powers, _product_sign(unit))
 
 
 def ratio(unit: str, other: str) -> float | None:
@@ -130,7 +134,7 @@ def _factors(unit: str) -> dict[str, int] | None:
     """The factors of a unit: name to power; None if it is not a product of powers."""
     factors: dict[str, int] = {}
     for place, part in enumerate(re.split(r"/", unit.strip())):
-        for piece in re.split(r"[·*]", part.strip().removeprefix("(").removesuffix(")")):
+        for piece in _pieces(part.strip().removeprefix("(").removesuffix(")")):
             if piece.strip() in ("", "1"):
                 continue
             found = _FACTOR.match(piece.strip())
@@ -141,13 +145,24 @@ def _factors(unit: str) -> dict[str, int] | None:
     return factors
 
 
-def _written(factors: Mapping[str, int]) -> str:
+def _pieces(product: str) -> list[str]:
+    spaced = product.split()
+    if len(spaced) > 1 and all((found := _FACTOR.match(piece)) and found["name"] in _SYMBOLS for piece in spaced):
+        return spaced
+    return re.split(r"[·*]", product)
+
+
+def _product_sign(unit: str) -> str:
+    return " " if " " in unit.strip() else "·"
+
+
+def _written(factors: Mapping[str, int], sign: str) -> str:
     above = [_raised(name, power) for name, power in factors.items() if power > 0]
     below = [_raised(name, -power) for name, power in factors.items() if power < 0]
     if not below:
-        return "·".join(above)
-    divisor = below[0] if len(below) == 1 else f"({'·'.join(below)})"
-    return f"{'·'.join(above) or '1'}/{divisor}"
+        return sign.join(above)
+    divisor = below[0] if len(below) == 1 else f"({sign.join(below)})"
+    return f"{sign.join(above) or '1'}/{divisor}"
 
 
 def _raised(name: str, power: int) -> str:

@@ -32,7 +32,7 @@ from mkc_torch.simulation.dynamics.horizons import horizons_of, log_likelihood_a
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid, key_of
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel
-from mkc_torch.simulation.dynamics.ports import ENTRY, RATES
+from mkc_torch.simulation.dynamics.ports import ENTRIES, RATES
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -297,12 +297,14 @@ def is_implausible(fit: FittedModel, basis: ScoreBasis) -> bool:
             return True
     for term, gamma in zip(model.terms, model.gammas(fit.parameters), strict=True):
         port = prepared.ports[term.port]
-        if port.kind not in (*RATES, ENTRY):
+        if port.kind not in (*RATES, *ENTRIES):
             continue
         signal = signals[term.port]
         change = term.effect.change(gamma, term.shape, term.context(prepared, signal))[:, 0].detach()
         usual = float(change.abs().nan_to_num(torch.inf).quantile(_USUAL))
-        gains = typical_gains(prepared.open_loop(), port.channels[0]) if port.kind == ENTRY else {port.channels[0]: 1.0}
+        gains = (
+            typical_gains(prepared.open_loop(), port.channels[0]) if port.kind in ENTRIES else {port.channels[0]: 1.0}
+        )
         if any(not gain * usual <= largest[name] for name, gain in gains.items() if name in largest):
             return True
     return False

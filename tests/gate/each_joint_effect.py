@@ -57,6 +57,14 @@ def _length(spec: Any, size: float) -> None:
     spec.body("fore").pos = [0.0, 0.0, -0.4 - size]
 
 
+def _shaft(spec: Any, size: float) -> None:
+    """Add a wheel on a flexible shaft at the shoulder, with a frequency of 4 Hz."""
+    wheel = spec.body("upper").add_body(name="wheel")
+    wheel.explicitinertial, wheel.mass, wheel.inertia = True, 1e-3, [size] * 3
+    stiffness = size * (2.0 * np.pi * 4.0) ** 2
+    wheel.add_joint(name="shaft", axis=[0.0, 1.0, 0.0], stiffness=stiffness, damping=0.01 * stiffness)
+
+
 def _hidden(element: Element, parameter: str = "change") -> Hidden:
     return Hidden(element.effect, element.at[0], element.sizes, parameter, element.write)
 
@@ -71,6 +79,7 @@ HIDDEN: Mapping[str, Hidden] = {
     "tilt": _hidden(elements.tilt((0.03, 0.1))),
     "zero": _hidden(elements.zero("elbow", (0.05, 0.15))),
     "inertia": _hidden(elements.inertia("elbow", (0.003, 0.01))),
+    "shaft": Hidden("hidden_mode", "input shoulder_force", (0.05, 0.15), "inertia", _shaft),
 }
 
 
@@ -97,7 +106,7 @@ def recorded(kind: str, index: int, seed: int) -> tuple[float, dict[str, torch.T
     control = np.array([2.0, 0.3]) * slow + np.array([1.2, 0.25]) * fast
     angles = np.empty((SAMPLES, 2))
     for row in range(SAMPLES):
-        angles[row] = data.qpos[:2]
+        angles[row] = data.joint("shoulder").qpos[0], data.joint("elbow").qpos[0]
         data.ctrl[:] = control[row]
         mujoco.mj_step(model, data, round(SAMPLE_S / model.opt.timestep))
     digit = 2.0 * np.pi / 2**ENCODER_BITS

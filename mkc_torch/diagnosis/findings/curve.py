@@ -140,5 +140,5 @@ def places_of(term: Term, channels: Sequence[str]) -> tuple[str, ...]:
     """Return the places on which a term acts: channels of a residual, or rates, inputs and parameters."""
     if "rate of " in term.at or term.at.startswith("exchange of "):
         return tuple(f"rate of {name}" for name in channels)
-    kind = "input" if term.at.startswith("entry of ") else term.at.partition(" ")[0]
+    kind = "input" if "entry of " in term.at else term.at.partition(" ")[0]
     return tuple(f"{kind} {name}" if kind in ("input", "parameter", "constant") else name for name in channels)

@@ -43,10 +43,10 @@ def mjcf_source(parts: Sequence[Part]) -> tuple[str, tuple[str, ...]]:
                 name = term.port.removeprefix("constant ")
                 changed[name] = changed.get(name, 0.0) + float(gamma[0])
                 continue
-            joint = joints.get(term.port.removeprefix("entry of "))
+            joint = joints.get(term.port.rpartition("entry of ")[2])
             attribute = _ATTRIBUTES.get(term.effect.id)
             if joint is None or attribute is None or term.driver is not None or not float(gamma[0]) > 0.0:
-                others.append(f"{term.effect.display_name} at the {term.port.removeprefix('entry of ')}")
+                others.append(f"{term.effect.display_name} at the {term.port.rpartition('entry of ')[2]}")
                 continue
             added[joint, attribute] = added.get((joint, attribute), 0.0) + float(gamma[0])
     only = f" Only corrected.py has: {'; '.join(others)}." if others else ""

@@ -73,7 +73,7 @@ def python_source(
     """
     kind = type(system)
     rates: list[str] = []
-    memories = {name: like for term in terms for name, like in _memories(term).items()}
+    memories = {name: like for term in terms for name, like in _memories(term, system).items()}
     inputs: list[str] = []
     entering: list[str] = []
     outputs: list[str] = []
@@ -85,6 +85,9 @@ def python_source(
         kinds = {"output": outputs, "input": inputs, "constant": inputs, "entry": entering, "parameter": varied}
         place = kinds.get(term.port.partition(" ")[0], rates)
         place = single if term.port.startswith("output ") else place
+        if " entry of " in term.port:  # the force acts at the input, and its internal states have rates
+            rates += [f"# {term.effect.id}: {term.effect.equation}", *lines[1:], *_over_a_step(term, system)]
+            place, lines = entering, lines[:1]
         if place is outputs and outputs:
             place.append("y = dict(shown)")  # the next effect acts on these outputs
         place += [f"# {term.effect.id}: {term.effect.equation}", *lines]
@@ -298,10 +301,25 @@ def _sensor(outputs: list[str]) -> list[str]:
     return ["", "    def sensor(self, time, y, p, run):", *(f"        {line}" for line in lines)]
 
 
-def _memories(term: Term) -> dict[str, str]:
+def _memories(term: Term, system: Dynamics) -> dict[str, str]:
     """Return an effect's internal states, each with the state that gives its initial value; empty for 0."""
-    kind, _, state = term.port.rpartition(" of ")
-    return memory_at(kind, state)
+    kind, _, place = term.port.rpartition(" of ")
+    return memory_at(term.effect.port, _speed_at(place, system)) if "entry" in kind else memory_at(kind, place)
+
+
+def _over_a_step(term: Term, system: Dynamics) -> list[str]:
+    """Return the line by which a deflection moves with the speeds at the end of a step."""
+    if not term.port.startswith("resonant") or system.steps is None:
+        return []
+    deflection, speed = (f'rates["{name}"]' for name in _memories(term, system))
+    own = _speed_at(term.port.rpartition(" of ")[2], system)
+    return [f'{deflection} = {deflection} + self.time_step * ({speed} - rates["{own}"])']
+
+
+def _speed_at(name: str, system: Dynamics) -> str:
+    """Return the state that is the speed at an input."""
+    known = known_parameters(system.name, system.parameters)
+    return entries(system, known, kinematic(system, known))[name]
 
 
 def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Sequence[str]) -> list[str]:
@@ -317,7 +335,7 @@ def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Seque
     before: list[str] = []
     if "rate of " in term.port:
         state = term.port.rpartition("rate of ")[2]
-        memories = _memories(term)
+        memories = _memories(term, system)
         targets = [f'rates["{name}"]' for name in (state, *memories)]
         names = _parts(state, system) | _numbered([f"x.{name}" for name in memories])
         before = _load(state) if term.port.startswith("loaded") else []
@@ -325,12 +343,10 @@ def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Seque
         first, _, other = term.port.removeprefix("exchange of ").partition(" and ")
         targets = [f'rates["{first}"]', f'rates["{other}"]']
         names = {"own": f"x.{first}", "other": f"x.{other}"}
-    elif term.port.startswith("entry of "):
-        name = term.port.removeprefix("entry of ")
-        known = known_parameters(system.name, system.parameters)
-        speed = entries(system, known, kinematic(system, known))[name]
-        targets = [f"acting.{name}"]
-        names = _parts(speed, system)
+    elif "entry of " in term.port:
+        name, memories = term.port.rpartition("entry of ")[2], _memories(term, system)
+        targets = [f"acting.{name}", *(f'rates["{memory}"]' for memory in memories)]
+        names = _parts(_speed_at(name, system), system) | _numbered([f"x.{memory}" for memory in memories])
     elif term.port.startswith(("input ", "constant ")):
         name = term.port.partition(" ")[2]
         targets, names = [f"acting.{name}"], {"own": f"acting.{name}"}

@@ -193,10 +193,10 @@ def short_name(effect: Effect, port: str) -> str:
         >>> short_name(InputLag(), "input torque"), short_name(Coupling(), "exchange of warm and cold")
         ('torque', 'warm and cold')
     """
-    for prefix in (f"{effect.port} of ", f"{effect.port} ", "entry of "):
+    for prefix in (f"{effect.port} of ", f"{effect.port} "):
         if port.startswith(prefix) and port != prefix:
             return port.removeprefix(prefix)
-    return port
+    return port.rpartition("entry of ")[2]
 
 
 def _quoted(name: str, pattern: str) -> str:

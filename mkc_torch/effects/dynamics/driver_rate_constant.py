@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from mkc_torch._support.unit_text import quotient
 from mkc_torch.effects.context import Context, Shape
-from mkc_torch.effects.dynamics.rate import SURROUNDINGS, RateEffect
+from mkc_torch.effects.dynamics.rate import SURROUNDINGS, RateEffect, second_mass
 from mkc_torch.effects.kinds import MOTION
 from mkc_torch.effects.waveforms import per
 
@@ -68,7 +69,9 @@ class DriverRateConstant(RateEffect):
         return (dict.fromkeys(self.form_parameters, 1.0),)
 
     def unit(self, context: Context) -> str:
-        return per("1/s", f"({context.units[0]})" if "/" in context.units[0] else context.units[0])
+        # at a force the loss is one of it per speed
+        loss = quotient(context.signal_unit, context.unit_of("own")) if second_mass(context).unit else "1/s"
+        return per(loss, f"({context.units[0]})" if "/" in context.units[0] else context.units[0])
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         own = context.part("own")

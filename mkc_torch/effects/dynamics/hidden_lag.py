@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._support.unit_text import duration, share_of
+from mkc_torch._support.unit_text import duration
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.dynamics.rate import RateEffect, second_mass, size_of_second
 from mkc_torch.effects.kinds import MOTION, kind_at
 from mkc_torch.effects.waveforms import lagged
 
@@ -35,7 +35,8 @@ class HiddenLag(RateEffect):
     Simulation: adds ``γ (z − x) / τ`` to the rate of a state x, with an internal state z that starts at x:
         ``τ ż = x − z``. What the state loses, the store gains.
     Drivers: the state only, with its history since the start of the run.
-    Units: γ, the store's capacity as a share of the state's, is a number; the time constant τ in s.
+    Units: γ, the store's capacity as a share of the state's, is a number, or at the force on a joint an inertia in
+        kg m² or kg; the time constant τ in s.
     Plausible: γ from 0 to 100: the structure of a house holds up to some 50 times the heat of its air. A store with a
         very short lag only adds to the capacity; where that is a parameter of the simulation, γ is not identifiable
         without this bound.
@@ -76,7 +77,7 @@ class HiddenLag(RateEffect):
         known = self.stores.get(kind_at(context), "a second store")
         evens_out = "catching up" if kind_at(context) in MOTION else "exchanging"
         time = duration(float(shape["time_constant"]))
-        return f"{known}, {share_of(float(gamma[0]))} of the first, {evens_out} in {time}"
+        return f"{known}, {size_of_second(float(gamma[0]), context, 'of the first')}, {evens_out} in {time}"
 
     def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
         return (
@@ -95,7 +96,7 @@ class HiddenLag(RateEffect):
         return tuple({"time_constant": share * length} for share in SHARES)
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
-        return (Quantity(self.gain, 1, ""),)
+        return (second_mass(context),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
         """The exchange and, while a trajectory is solved, the rate of z, (N, 2); else along the known path, (N, 1)."""

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._support.unit_text import duration, share_of, sized
+from mkc_torch._support.unit_text import duration, sized
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.dynamics.rate import RateEffect, second_mass, size_of_second
 from mkc_torch.effects.kinds import MOTION, kind_at
 from mkc_torch.effects.runs import first_of_runs, linear_recurrence
 
@@ -70,8 +70,8 @@ class HiddenMode(RateEffect):
         s, 0 at the start of each run, and the second mass's speed w, which starts at v:
         ``ṡ = w − v``, ``ẇ = −ω² s − 2 ζ ω (w − v)``. For a level it is a second surface behind a column with inertia.
     Drivers: the state only, with its history since the start of the run.
-    Units: γ, the second mass as a share of the first, is a number; the period 2π/ω in s; the damping ratio ζ is a
-        number.
+    Units: γ, the second mass as a share of the first, is a number, or at the force on a joint its inertia in kg m² or
+        kg; the period 2π/ω in s; the damping ratio ζ is a number.
     Plausible: γ from 0 to 10. A second mass on a stiff spring only adds to the first; where that is a parameter of the
         simulation, γ is not identifiable without this bound.
     Source: Den Hartog, "Mechanical Vibrations" (1956), 3.2; Spong, Journal of Dynamic Systems, Measurement, and Control
@@ -110,8 +110,8 @@ class HiddenMode(RateEffect):
         plain = ("a second mass", "of the moving one", "on a spring") if kind in MOTION else _SOMETHING
         what, of_what, behind = self.seconds.get(kind, plain)
         frequency, damping = _frequency(float(shape["period"])), float(f"{float(shape['damping']):.1g}")
-        share = share_of(float(gamma[0]))
-        return f"{what}, {share} {of_what}, {behind}: {frequency}, damping ratio {sized(damping)}"
+        size = size_of_second(float(gamma[0]), context, of_what)
+        return f"{what}, {size}, {behind}: {frequency}, damping ratio {sized(damping)}"
 
     def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
         return f"Not in the equations is {self.second(gamma, shape, context)}."
@@ -128,7 +128,7 @@ class HiddenMode(RateEffect):
         return tuple({"period": shortest * ratio**k, "damping": DAMPING} for k in range(PERIODS))
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
-        return (Quantity(self.gain, 1, ""),)
+        return (second_mass(context),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
         """The force and, while a trajectory is solved, the rates of s and w, (N, 3); else along the path, (N, 1)."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from mkc_torch._support.unit_text import quotient
+from mkc_torch._support.unit_text import quotient, share_of, sized
 from mkc_torch.effects.base import GainEffect
 from mkc_torch.effects.context import Context, Quantity, Shape
 
@@ -50,6 +50,32 @@ class RateEffect(GainEffect):
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity(self.gain, 1, self.unit(context)),)
+
+
+_INERTIA = {("N m", "rad/s"): "kg m²", ("N", "m/s"): "kg"}
+"""Unit of an inertia, by the units of a force and of its speed."""
+
+
+def second_mass(context: Context) -> Quantity:
+    """A second mass or store: at a rate a share of the first, at an input that is a force its own inertia.
+
+    Example:
+        >>> import torch
+        >>> joint = Context(
+        ...     torch.zeros(1), torch.zeros(1, 0), (), torch.zeros(1, 1), "N m", ("f",), part_units={"own": "rad/s"}
+        ... )
+        >>> second_mass(joint)
+        Quantity(name='inertia', size=1, unit='kg m²')
+    """
+    own = context.unit_of("own")
+    unit = _INERTIA.get((context.signal_unit, own), "")
+    return Quantity("inertia" if unit else "share", 1, unit)
+
+
+def size_of_second(gamma: float, context: Context, of_what: str) -> str:
+    """The size of a second mass or store as a phrase."""
+    unit = second_mass(context).unit
+    return sized(float(f"{gamma:.2g}"), unit) if unit else f"{share_of(gamma)} {of_what}"
 
 
 def beyond(values: Float[Tensor, " N"], place: float | Tensor, exponent: float | Tensor) -> Float[Tensor, " N"]:

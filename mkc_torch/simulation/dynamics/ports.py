@@ -35,6 +35,11 @@ RATES = ("rate", "loaded rate", *_MEMORIES, "exchange")
 ENTRY = "entry"
 """Kind of the ports where effects of a rate add to an input, which moves several rates."""
 
+_ENTRY_OF = {kind: kind.replace("rate", ENTRY) for kind in _MEMORIES}
+
+ENTRIES = (ENTRY, *_ENTRY_OF.values())
+"""Kinds of ports at which an effect that depends on states adds to an input."""
+
 _REVERSED = 0.05
 """Share of the recording for which a state must be positive, and negative, to count as reversing."""
 
@@ -110,7 +115,12 @@ class PortContext:
                 clock=self.clock,
                 run=self.run[self.clock.before],
             )
-        places |= {f"entry of {name}": self._entry_port(name, speed) for name, speed in self._entries().items()}
+        for name, speed in self._entries().items():
+            places[f"entry of {name}"] = self._entry_port(name, speed, "rate")
+            # elsewhere the rates have these effects
+            for kind in self._remembering(self._parts(speed)) if name in forces else ():
+                port = self._entry_port(name, speed, kind)
+                places[f"{port.kind} of {name}"] = replace(port, memory=memory_at(kind, speed))
         for name in constants:
             parts, unit = {"own": name}, self._unit_of(name)
             places[f"constant {name}"] = Port(
@@ -161,10 +171,10 @@ class PortContext:
         found = entries(self.system, self.known, self.kinematic)
         return {name: speed for name, speed in found.items() if name not in self._surroundings.values()}
 
-    def _entry_port(self, name: str, speed: str) -> Port:
+    def _entry_port(self, name: str, speed: str, stands_for: str) -> Port:
         parts = {part: of for part, of in self._parts(speed).items() if part != "surroundings"}
-        port = self._rate_port(speed, ENTRY, parts)
-        return replace(port, channels=(name,), unit=self._unit_of(name), stands_for="rate")
+        port = self._rate_port(speed, _ENTRY_OF.get(stands_for, ENTRY), parts)
+        return replace(port, channels=(name,), unit=self._unit_of(name), stands_for=stands_for)
 
     def _remembering(self, parts: Mapping[str, str]) -> tuple[str, ...]:
         """Kinds of ports with internal states at the rate of a state with these parts."""
@@ -244,7 +254,9 @@ class PortContext:
 
 
 def memory_at(kind: str, state: str) -> dict[str, str]:
-    """Internal states at the rate of a state, with the state that each starts equal to; empty to start at 0.
+    """Internal states at the rate of a state, or at an input with this speed, with the state that each starts equal to.
+
+    An internal state without such a state starts at 0.
 
     Example:
         >>> memory_at("resonant rate", "speed"), memory_at("rate", "speed")

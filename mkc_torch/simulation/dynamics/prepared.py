@@ -21,6 +21,7 @@ from mkc_torch.simulation.dynamics.checked import AT_START, CheckedDynamics
 from mkc_torch.simulation.dynamics.checks import SampledStates, check_functions
 from mkc_torch.simulation.dynamics.compiled.faithful import is_faithful
 from mkc_torch.simulation.dynamics.compiled.residual import CompiledDynamics, compiled_dynamics
+from mkc_torch.simulation.dynamics.entering import entered, over_a_step
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.first_guess import despiked, first_guess
 from mkc_torch.simulation.dynamics.first_parameters import first_parameters
@@ -28,7 +29,7 @@ from mkc_torch.simulation.dynamics.layout import InputRows, lay_out
 from mkc_torch.simulation.dynamics.missing import MissingOutputs, with_lines
 from mkc_torch.simulation.dynamics.observer import Observer
 from mkc_torch.simulation.dynamics.own_offsets import equations_with_offsets
-from mkc_torch.simulation.dynamics.ports import ENTRY, RATES, PortContext, common_unit
+from mkc_torch.simulation.dynamics.ports import ENTRIES, RATES, PortContext, common_unit
 from mkc_torch.simulation.dynamics.prior import prior_of
 from mkc_torch.simulation.dynamics.refinement import FINEST, enough_parts
 from mkc_torch.simulation.dynamics.rollout import rolled_out, rolls_out
@@ -282,11 +283,11 @@ class PreparedDynamics(CheckedDynamics):
         at_stations = at_stations[:, : len(self.system.states)]
         here, at_samples = self.acting_at_samples(theta, changes), found.states[self.rows]
         outputs, plain = self._outputs(here, changes, at_samples), self.predicted(here, {})(at_samples)
-        rates = self._rates(self._entered(at_stations, acting, changes), at_stations)
+        rates = self._rates(entered(self.ports, self.system.inputs, acting, at_stations, changes)[0], at_stations)
         at = {
             name: self._signal(port, acting, at_stations, rates)
             for name, port in self.ports.items()
-            if port.kind in (*RATES, ENTRY)
+            if port.kind in (*RATES, *ENTRIES)
         }
         at |= {port_of(self.system.steps, name): self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
         still = torch.zeros_like(self.clock.time).unsqueeze(-1)
@@ -357,6 +358,7 @@ class PreparedDynamics(CheckedDynamics):
         remembering = self.remembering(changes)
         rows = [*self.system.states, *(name for memory in remembering.values() for name in memory)]
         lasting, n = self.lasting, len(self.system.states)
+        held_at = {name: [rows.index(row) for row in memory] for name, memory in remembering.items()}
         added_at = [
             (port, [rows.index(row) for row in (*port.channels, *remembering.get(name, ()))], name)
             for name, port in self.ports.items()
@@ -365,8 +367,15 @@ class PreparedDynamics(CheckedDynamics):
 
         def rate(states: Tensor) -> Tensor:
             own, memories, disturbances = states.split([n, len(rows) - n, len(lasting)], -1)
-            plain = self._rates(self._entered(own, now, changes), own)
+            held = {name: states[:, places] for name, places in held_at.items()}
+            driven, of_memories = entered(self.ports, self.system.inputs, now, own, changes, held)
+            plain = self._rates(driven, own)
             rates = [*plain, *(torch.zeros_like(memory) for memory in memories.unbind(-1))]
+            for name, found in of_memories.items():
+                for k, added in zip(
+                    held_at[name], over_a_step(self.ports[name], found, plain, self.system), strict=True
+                ):
+                    rates[k] = added
             for port, places, name in added_at:
                 signal = self._signal(port, now, own, plain)
                 if name in remembering:
@@ -380,16 +389,6 @@ class PreparedDynamics(CheckedDynamics):
             return torch.stack(rates, -1)
 
         return rate
-
-    def _entered(self, states: Tensor, acting: Acting, changes: Changes) -> Acting:
-        """The acting inputs with the effects at their entries, which depend on the states."""
-        added = {name: changes[f"entry of {name}"] for name in self.system.inputs if f"entry of {name}" in changes}
-        if not added:
-            return acting
-        signal = torch.cat([states, acting.inputs], -1)
-        columns = zip(self.system.inputs, acting.inputs.unbind(-1), strict=True)
-        inputs = [own + added[name](signal)[:, 0] if name in added else own for name, own in columns]
-        return acting._replace(inputs=torch.stack(inputs, -1))
 
     def _rates(self, acting: Acting, states: Tensor) -> list[Tensor]:
         """Rates of the states by the simulation's own equations."""

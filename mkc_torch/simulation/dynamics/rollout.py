@@ -11,7 +11,7 @@ from torch import Tensor
 from mkc_torch.simulation.continuation import is_plain
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.observer import Observer
-from mkc_torch.simulation.dynamics.ports import ENTRY, RATES
+from mkc_torch.simulation.dynamics.ports import ENTRIES, RATES
 from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory, solve
 from mkc_torch.simulation.dynamics.varying import Acting
 from mkc_torch.simulation.ports import Change, Changes, Port
@@ -42,7 +42,7 @@ def rolls_out(prepared: Stepping, theta: Float[Tensor, " p"], changes: Changes) 
     """Whether a trajectory is one call of a simulation that steps: no force depends on its states."""
     if prepared.system.steps is None or prepared.observer is not None or not is_plain(theta):
         return False
-    return not any(prepared.ports[name].kind in (*RATES, ENTRY) for name in changes if name in prepared.ports)
+    return not any(prepared.ports[name].kind in (*RATES, *ENTRIES) for name in changes if name in prepared.ports)
 
 
 def rolled_out(

@@ -198,13 +198,14 @@ class Stepper(Dynamics):
         m = len(self._driven)
         given, known = inputs.detach().cpu().numpy(), {name: float(value) for name, value in vars(p).items()}
         x, forces = state[0].detach().cpu().numpy(), slice(m, m + len(self.forces))
+        x, more = np.split(x, [len(self._evaluation.states)])  # internal states of effects have no steps of their own
         changed = self._evaluation.changed(given[0, forces.stop :]) if len(given) else {}
         if changed is None:
-            return inputs.new_full((len(given), len(x)), torch.nan)
+            return inputs.new_full((len(given), len(state[0])), torch.nan)
         named = Names(**known, **changed)
         with np.errstate(over="ignore", invalid="ignore"):  # where the simulation diverges
             found = self.rollout(x, given[:, :m], given[:, forces], named, self.time_step)
-        return torch.from_numpy(found).to(state)
+        return torch.from_numpy(np.concatenate([found, np.tile(more, (len(found), 1))], 1)).to(state)
 
     def _evaluated(self, outputs: bool, time: Tensor, x: Any, u: Any, p: Any) -> Tensor:
         evaluation, given = self._evaluation, vars(u)
