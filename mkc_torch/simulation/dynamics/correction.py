@@ -86,7 +86,7 @@ class DynamicsCorrection:
         prepared = self.prepared
         known = theta[: len(prepared.known)]
         own = self.own_states
-        first = prepared.start()[len(known) :] if start is None else start
+        first = prepared.given[len(known) :] if start is None else start
         # stiff friction can defeat Newton's method from the guess; the fit then starts from this trajectory
         found = prepared.trajectory(torch.cat([known, first]), changes, patient=True)
         if not found.converged:
