@@ -7,12 +7,14 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis import diagnose
+from mkc_torch.effects import DYNAMICS
 from mkc_torch.recording import Recording
 from mkc_torch.simulation import Parameter, SimulationError, Stepper, load_mjcf
 from tests.simulation.stepped.models import TWO_LINKS
 
 CHANGES = {
     "lower_mass": 0.2,
+    "lower_centre": 0.03,
     "lower_distance": 0.05,
     "base_tilt_x": 0.07,
     "base_tilt_y": -0.1,
@@ -119,6 +121,12 @@ def by_the_spec(path, name, amount):
         load.type, load.size, load.mass = mujoco.mjtGeom.mjGEOM_SPHERE, [1e-4, 0.0, 0.0], amount
         load.pos = plain.body_ipos[plain.body(part).id]
         load.contype, load.conaffinity = 0, 0
+    elif kind == "centre":
+        model, body = spec.compile(), spec.body(part)
+        place = model.body(part).id
+        body.explicitinertial, body.mass, body.inertia = True, model.body_mass[place], model.body_inertia[place]
+        body.iquat, length = model.body_iquat[place], np.linalg.norm(model.body_ipos[place])
+        body.ipos = model.body_ipos[place] * (1.0 + amount / length)
     elif kind == "distance":
         pos = np.array(spec.body(part).pos)
         spec.body(part).pos = pos * (1.0 + amount / np.linalg.norm(pos))
@@ -185,3 +193,26 @@ def test_the_file_with_a_changed_constant_simulates_the_same(two_links, name):
         for model in (by_the_spec(two_links, name, CHANGES[name]), mujoco.MjModel.from_xml_string(text))
     )
     assert np.abs(own - other).max() < 1e-4  # of the digits in the file
+
+
+@pytest.mark.e2e
+def test_a_payload_away_from_the_centre_of_mass_is_a_mass_and_a_centre(two_links):
+    mujoco = pytest.importorskip("mujoco")
+    spec = mujoco.MjSpec.from_file(str(two_links))
+    load = spec.body("lower").add_geom()
+    load.type, load.size, load.mass, load.pos = mujoco.mjtGeom.mjGEOM_SPHERE, [0.01, 0.0, 0.0], 0.15, [0.0, 0.0, -0.28]
+    load.contype, load.conaffinity = 0, 0
+    model, controls = spec.compile(), controls_of(150)
+    angles = angles_of(model, controls) + 1e-3 * np.random.default_rng(3).normal(size=(150, 2))
+    effects = tuple(effect for effect in DYNAMICS if effect.id == "constant_change")
+    pair = "constant_change@lower_mass + constant_change@lower_centre"
+    found = diagnose(load_mjcf(two_links, []), recorded(controls, angles), effects=effects, quick=True, suspect=pair)
+    scored = {frozenset(model.terms): model for model in found.decisions.models}
+    both, mass = (scored[frozenset(names.split(" + "))] for names in (pair, "constant_change@lower_mass"))
+    assert both.score > mass.score + 100.0
+    by_place = dict(zip(both.terms, (parameters[0].value for parameters in both.parameters), strict=True))
+    plain, new = load_mjcf(two_links).description.model, model.body("lower").id
+    # a load away from the centre also adds to the inertia about it, which neither number does
+    assert by_place["constant_change@lower_mass"] == pytest.approx(0.15, rel=0.25)
+    moved = np.linalg.norm(model.body_ipos[new]) - np.linalg.norm(plain.body_ipos[new])
+    assert by_place["constant_change@lower_centre"] == pytest.approx(moved, rel=0.5)

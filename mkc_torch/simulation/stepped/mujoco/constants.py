@@ -26,14 +26,15 @@ class Constant:
     """A number of the model.
 
     Attributes:
-        kind: "mass" of a body, in kg; "armature" of a joint, the inertia of its drive; "ref" of a joint, its angle in
-            the pose that the file draws, in rad; "distance" of a body from its parent's frame, in m; "tilt" of the
-            base, by which gravity leans towards an axis, in rad.
+        kind: "mass" of a body, in kg; "centre", distance of its centre of mass from its frame, in m; "armature" of a
+            joint, the inertia of its drive; "ref" of a joint, its angle in the pose that the file draws, in rad;
+            "distance" of a body from its parent's frame, in m; "tilt" of the base, by which gravity leans towards an
+            axis, in rad.
         place: number of the body, the joint or the axis in the model.
         parameter: its value in the file, with bounds and unit.
     """
 
-    kind: Literal["mass", "armature", "ref", "distance", "tilt"]
+    kind: Literal["mass", "centre", "armature", "ref", "distance", "tilt"]
     place: int
     parameter: Parameter
 
@@ -42,6 +43,8 @@ class Constant:
         place = self.place
         if self.kind == "mass":
             model.body_mass[place] = value
+        elif self.kind == "centre":
+            model.body_ipos[place] = original.body_ipos[place] * (value / self.parameter.value)
         elif self.kind == "armature":
             model.dof_armature[place] = value
         elif self.kind == "ref":
@@ -74,7 +77,7 @@ class Constant:
 def constants_of(
     model: Any, joints: Sequence[str], hinges: Sequence[bool], bodies: Sequence[str], taken: Sequence[str]
 ) -> dict[str, Constant]:
-    """The constants by name: masses of the outermost bodies, tilts, zeros of hinges, distances, inertias of drives.
+    """The constants by name: masses and centres of outermost bodies, tilts, zeros of hinges, lengths, drives' inertias.
 
     Args:
         model: the model, whose joints are hinges and slides.
@@ -95,6 +98,9 @@ def constants_of(
         if model.body_dofnum[k] and k not in carriers:
             mass = Parameter(float(model.body_mass[k]), lower=0.0, unit="kg")
             found[f"{bodies[k]}_mass"] = Constant("mass", k, mass)
+            centre = float(np.linalg.norm(model.body_ipos[k]))
+            if centre > 0.0:
+                found[f"{bodies[k]}_centre"] = Constant("centre", k, Parameter(centre, lower=0.0, unit="m"))
         if model.body_dofnum[k] and moves[model.body_parentid[k]] and away > 0.0:
             length = Parameter(away, lower=away / _LENGTH, upper=away * _LENGTH, unit="m")
             found[f"{bodies[k]}_distance"] = Constant("distance", k, length)
