@@ -16,7 +16,7 @@ def divergence_checks(prepared: PreparedDynamics) -> tuple[StartCheck, ...]:
     free, steps = prepared.observed(None), prepared.system.steps
     if steps is None:
         lost = ~free.residual(prepared.given, {}).isfinite().all(0)
-        names = [f"`{name}`" for name in prepared.channels]
+        names = prepared.channels
         cause = "Check signs and units of the values."
         where = ""
     else:
@@ -26,11 +26,11 @@ def divergence_checks(prepared: PreparedDynamics) -> tuple[StartCheck, ...]:
         wrong = ~states.isfinite()
         first = int(wrong.any(-1).long().argmax())
         lost = wrong[first]
-        names = [f"`{name}`" for name in prepared.system.states]
+        names = prepared.system.states
         where = f" from {float(prepared.grid.time[first] - prepared.time[0]):.4g} s on"
         cause = f"The time step, {steps.size:.4g} s, may be too long for the stiffness; check also units of the values."
     if not bool(lost.any()):
         return ()
     name = names[int(lost.long().argmax())]
-    text = f"With the given values, the free run of {name} is not finite{where}. {cause}"
-    return (StartCheck("diverges", (name.strip("`"),), text),)
+    text = f"With the given values, the free run of `{name}` is not finite{where}. {cause}"
+    return (StartCheck("diverges", (name,), text),)
