@@ -134,6 +134,7 @@ class DiagnosisInputs:
         stop: why the search was stopped before its end, and what was not done.
         models: the models that the search scored, in their order.
         column: the column whose other sign or unit explains more than any effect, in a sentence; empty if none does.
+        instead: the effects that take the place of fitted numbers far from those given, in sentences.
     """
 
     simulation: Simulation
@@ -146,6 +147,7 @@ class DiagnosisInputs:
     stop: Stop | None = None
     models: tuple[ScoredModel, ...] = ()
     column: str = ""
+    instead: str = ""
 
     @property
     def in_short(self) -> bool:
@@ -352,7 +354,7 @@ def _checks_of_fit(whole: DiagnosisInputs) -> tuple[StartCheck, ...]:
         return ()
     found = impossible_checks(prepared, impossible_values(prepared, fit.parameters))
     named = {name for check in found for name in check.parameters}
-    unlikely = unlikely_checks(prepared, fit.parameters, whole.final.parameters)
+    unlikely = unlikely_checks(prepared, fit.parameters, whole.final.parameters, whole.instead)
     diverging = optional("checking the given values", partial(divergence_checks, prepared), lambda: ())
     return (*diverging, *found, *(check for check in unlikely if named.isdisjoint(check.parameters)))
 

@@ -21,9 +21,10 @@ from mkc_torch.diagnosis.model.process_noise import (
     has_process_noise,
     with_noise_around,
 )
-from mkc_torch.diagnosis.model.shapes import shape_fitted
+from mkc_torch.diagnosis.model.shapes import described, shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time
+from mkc_torch.diagnosis.optional import optional
 from mkc_torch.diagnosis.pipeline.chains import (
     chain_of_line,
     chain_to,
@@ -37,10 +38,12 @@ from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.pipeline.suspected import suspected_models
 from mkc_torch.diagnosis.pipeline.trail import trail_of
 from mkc_torch.diagnosis.score import basis_of, score, separation
+from mkc_torch.diagnosis.search.at_given_values import instead_of_numbers
 from mkc_torch.diagnosis.search.beam import BeamSearch
 from mkc_torch.diagnosis.search.candidate import Candidate
 from mkc_torch.diagnosis.search.columns import best_change
-from mkc_torch.diagnosis.search.moves import comes_by_exchange
+from mkc_torch.diagnosis.search.in_words import terms_in_words
+from mkc_torch.diagnosis.search.moves import comes_by_exchange, with_wide_grid
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.search.screening import screened
@@ -122,6 +125,10 @@ def search_models(
         if 0 < len(found.found) < len(chain) and beam.best.key != chain[-1].key:
             again = _in_either_way(chain_to(beam.best, beam), beam, tested)
             found = again if len(again.found) > len(found.found) else found
+        if found.found and not options.quick:
+            progress("comparing with the values given")
+            work = partial(_instead, found.found[-1].fit, beam)
+            return replace(found, instead=optional("comparing with the values given", work, lambda: ""))
         if found.found or not found.unconfirmed:
             return found
         search = replace(search, unconfirmed=search.unconfirmed or found.unconfirmed)
@@ -363,6 +370,37 @@ def _refused(before: Evidence, after: Evidence, search: StepwiseSearch, options:
     difference = after.log_likelihood - before.log_likelihood
     generator = torch.Generator().manual_seed(options.seed)
     return gain_interval(difference, search.blocks.block, generator)[1][1] < 0.0
+
+
+def _instead(final: FittedModel, beam: BeamSearch) -> str:
+    """Return the effects that take the place of a model's unlikely numbers in sentences; empty if none do."""
+    wide = with_wide_grid(beam.terms, final.model.prepared.open_loop())
+    found = instead_of_numbers(beam, final, wide)
+    if found is None:
+        return ""
+    values = " and ".join(f"`{name}` at {value:.4g}" for name, value in found.values.items())
+    effects = " and ".join(_with_shape(term) for term in found.more)
+    sizes = size_of(found.model.fit.residual).tolist(), size_of(_free(final).residual).tolist()
+    names = final.model.prepared.channels
+    reached = ", ".join(
+        f"{name} {held:.3g} instead of {free:.3g}" for name, held, free in zip(names, *sizes, strict=True)
+    )
+    own = beam.value_of(_free(final))
+    gap = (own - found.model.value) / beam.basis.kappa
+    compared = f"{gap:.0f} nats less" if gap > 0.0 else f"{-gap:.0f} nats more"
+    return (
+        f"With {values}, the values given, the search finds {effects} in addition; the open-loop residual is then "
+        f"{reached}, and the score is {compared}. Only a measurement of the number tells the two explanations apart."
+    )
+
+
+def _with_shape(term: Term) -> str:
+    shape = described(term.effect, term.shape)
+    return f"{terms_in_words([term])} ({shape})" if shape else terms_in_words([term])
+
+
+def _free(fit: FittedModel) -> FittedModel:
+    return fit if fit.open_loop is None else fit.open_loop
 
 
 def _follow(beam: BeamSearch) -> tuple[FittedModel, ...]:

@@ -175,6 +175,7 @@ class PartialResult:
             stop,
             search.models,
             search.column,
+            search.instead,
         )
         result = with_search_notes(build_diagnosis(whole, answers), search)
         offsets = offsets_of(answers.case.final, self.recordings) if self.recordings else ()

@@ -27,6 +27,7 @@ class StepwiseSearch:
         cut: whether there was a further finding beyond the limit.
         models: the models that the search scored, in the order in which they were tried.
         column: the column whose other sign or unit explains more than any effect, in a sentence; empty if none does.
+        instead: the effects that take the place of fitted numbers far from those given, in sentences; empty if none do.
     """
 
     first: SearchResult | None
@@ -40,6 +41,7 @@ class StepwiseSearch:
     cut: bool = False
     models: tuple[ScoredModel, ...] = ()
     column: str = ""
+    instead: str = ""
 
     @property
     def pairs(self) -> tuple[tuple[Evidence, Evidence], ...]:

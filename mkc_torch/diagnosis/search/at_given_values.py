@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -14,9 +14,11 @@ from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Term, run_parallel
 from mkc_torch.diagnosis.search.along_noise import Models
+from mkc_torch.diagnosis.search.candidate import Candidate
 from mkc_torch.diagnosis.search.move_fits import fitted_with
 from mkc_torch.diagnosis.search.moves import additions, one_form_each
 from mkc_torch.nonlinear import NoFitError
+from mkc_torch.simulation.dynamics.unlikely import is_unlikely
 
 _TRIED = 3
 """Effects that are fitted at each step, of which the most likely is kept."""
@@ -39,18 +41,86 @@ def add_at_given_values(beam: Models, start: FittedModel, terms: Sequence[Term])
     """
     most = min(beam.most_terms, _MOST)
     held = _held(start, beam.settings.search.ran_away) if most > 1 else None
-    named = [term for term in terms if not term.effect.is_curve]
     while held is not None and len(held.model.terms) < most:
-        before, value = held, _worth(held, beam)
-        found = one_form_each(additions(held, named, beam.settings.noise), beam.worth)
-        found = [one for one in sorted(found, key=beam.worth, reverse=True)[:_TRIED] if beam.worth(one) > 0.0]
-        tried = run_parallel([partial(fitted_with, held, one) for one in found], start.model.prepared, beam.terms)
-        held = max(tried, key=partial(_worth, beam=beam), default=held)
-        if not _worth(held, beam) > value:
-            return
-        if before.model.terms:
+        several, held = bool(held.model.terms), _with_one_more(held, beam, terms)
+        if several and held is not None:
             model = beam.scored("choose effects at the given values", partial(_released, held, start))
             beam.keep([] if model is None else [replace(model, together=True)])
+
+
+@dataclass(frozen=True)
+class AtGivenValues:
+    """A model in which further effects take the place of fitted numbers that are far from the values given.
+
+    Attributes:
+        values: the values given, by parameter, at which these are held.
+        model: the model, whose last effects are the further effects.
+        more: the further effects.
+    """
+
+    values: Mapping[str, float]
+    model: Candidate
+    more: tuple[Term, ...]
+
+
+def instead_of_numbers(beam: Models, final: FittedModel, terms: Sequence[Term]) -> AtGivenValues | None:
+    """Return the model in which effects take the place of the unlikely numbers of a model; None where it has none.
+
+    A servo that is too soft follows late, and so does a servo with a delay: the recording may prefer the number, and
+    only its measurement tells them apart.
+
+    Args:
+        beam: the search that found the model.
+        final: the model.
+        terms: the candidates, with the shapes of their grids.
+    """
+    free = final if final.open_loop is None else final.open_loop
+    values: dict[str, float] = {}
+    held: FittedModel | None = free
+    while held is not None and (far := unlikely_values(held).keys() - values.keys()):
+        values |= {name: value for name, value in unlikely_values(held).items() if name in far}
+        held = _held_at(held, values)
+    known = len(free.model.terms)
+    better = held if values else None
+    while better is not None and len(better.model.terms) < min(beam.most_terms, known + _MOST):
+        held, better = better, _with_one_more(better, beam, terms)
+    held = held if better is None else better
+    more = () if held is None else held.model.terms[known:]
+    model = beam.scored("hold unlikely numbers", lambda: held) if more else None
+    return None if model is None else AtGivenValues(values, model, tuple(more))
+
+
+def unlikely_values(fit: FittedModel) -> dict[str, float]:
+    """Return the values given for the parameters that a fit takes far from these."""
+    system = fit.model.prepared.dynamics
+    if system is None:
+        return {}
+    pairs = zip(system.known.items(), fit.parameters.tolist(), strict=False)
+    return {name: known.value for (name, known), value in pairs if is_unlikely(system, known, value)}
+
+
+def _held_at(fit: FittedModel, values: Mapping[str, float]) -> FittedModel | None:
+    """Return the fit with some parameters held at given values."""
+    system = fit.model.prepared.dynamics
+    assert system is not None
+    start, (low, high) = fit.parameters.clone(), system.bounds
+    low, high = low.clone(), high.clone()
+    for number, name in enumerate(system.known):
+        if name in values:
+            start[number] = low[number] = high[number] = values[name]
+    held = copy.copy(system)
+    held.bounds = low, high
+    return _fitted(JointModel(held, fit.model.terms, fit.model.near), fit, start)
+
+
+def _with_one_more(held: FittedModel, beam: Models, terms: Sequence[Term]) -> FittedModel | None:
+    """Return the fit with the further effect that is worth most; None where none is worth its price."""
+    named = [term for term in terms if not term.effect.is_curve]
+    found = one_form_each(additions(held, named, beam.settings.noise), beam.worth)
+    found = [one for one in sorted(found, key=beam.worth, reverse=True)[:_TRIED] if beam.worth(one) > 0.0]
+    tried = run_parallel([partial(fitted_with, held, one) for one in found], held.model.prepared, beam.terms)
+    best = max(tried, key=partial(_worth, beam=beam), default=held)
+    return best if _worth(best, beam) > _worth(held, beam) else None
 
 
 def _worth(fit: FittedModel, beam: Models) -> float:

@@ -18,7 +18,7 @@ _FAR = 3.0
 
 
 def unlikely_checks(
-    prepared: CheckedDynamics, alone: Float[Tensor, " p"], found: Float[Tensor, " p"]
+    prepared: CheckedDynamics, alone: Float[Tensor, " p"], found: Float[Tensor, " p"], instead: str = ""
 ) -> tuple[StartCheck, ...]:
     """Return a check for each parameter that the fit without effects takes far from its given value.
 
@@ -28,25 +28,22 @@ def unlikely_checks(
         prepared: the simulation; only parameters with an ``uncertainty`` are checked.
         alone: (p,), parameters of the fit without effects.
         found: (p,), of the fit with the effects found.
+        instead: what is found with such numbers held at the values given, in sentences; empty if it is not known.
     """
     checks = []
     for number, (name, known) in enumerate(prepared.known.items()):
         first, last = float(alone[number]), float(found[number])
-        by_factor = prepared.system.steps is not None and known.lower == 0.0 < known.value
-        if distance(known, first, by_factor=by_factor) <= _FAR:
+        if not is_unlikely(prepared, known, first):
             continue
+        by_factor = _by_factor(prepared, known)
         expected = (
             f"within a factor of {math.exp(_spread(known)):.2g}"
             if by_factor
             else f"with a standard deviation of {known.uncertainty:.3g}"
         )
-        near = distance(known, last, by_factor=by_factor) <= _FAR
-        after = (
-            f"With what was found it is {last:.4g}."
-            if near
-            else f"With what was found it is {last:.4g}. If {known.value:.4g} was measured, give it without letting it "
-            "be fitted, and diagnose again: the effects that this number replaces are then found."
-        )
+        after = f"With what was found it is {last:.4g}."
+        if is_unlikely(prepared, known, last):
+            after = f"{after} {instead or _again(known)}"
         given = f"{known.value:.4g} {known.unit}".rstrip()
         sentence = (
             f"`{name}` ends at {first:.4g} without effects; given was {given}, {expected}: it can take the place of "
@@ -54,6 +51,23 @@ def unlikely_checks(
         )
         checks.append(StartCheck("unlikely value", (name,), sentence, start=known.value))
     return tuple(checks)
+
+
+def is_unlikely(prepared: CheckedDynamics, known: Parameter, value: float) -> bool:
+    """Whether a fitted value is unlikely by the value given and its uncertainty."""
+    return distance(known, value, by_factor=_by_factor(prepared, known)) > _FAR
+
+
+def _by_factor(prepared: CheckedDynamics, known: Parameter) -> bool:
+    """Whether a value is compared by its factor: a positive number of a simulation that steps."""
+    return prepared.system.steps is not None and known.lower == 0.0 < known.value
+
+
+def _again(known: Parameter) -> str:
+    return (
+        f"If {known.value:.4g} was measured, give it without letting it be fitted, and diagnose again: the effects "
+        "that this number replaces are then found."
+    )
 
 
 def distance(known: Parameter, value: float, *, by_factor: bool) -> float:

@@ -28,8 +28,16 @@ def evaluated(
         outputs: return outputs instead of rates.
         time: (S,), in s.
         states, inputs: (S, n), (S, m).
-        parameters: (p,).
+        parameters: (p,), a number each.
+
+    Raises:
+        ValueError: a parameter varies from sample to sample.
     """
+    if parameters.dim() != 1:
+        raise ValueError(
+            f"parameters: expected (p,), a number for each, got {tuple(parameters.shape)}. A simulation outside torch "
+            "has the same parameters at all samples."
+        )
     return _values(evaluation, outputs, time, states, inputs, parameters)
 
 

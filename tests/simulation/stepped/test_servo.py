@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 import torch
 
-from mkc_torch import Recording
+from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import candidate_terms
 from mkc_torch.diagnosis.pipeline.chains import chains_to_test
 from mkc_torch.diagnosis.score import basis_of, is_implausible
-from mkc_torch.diagnosis.search.at_given_values import add_at_given_values
+from mkc_torch.diagnosis.search.at_given_values import add_at_given_values, instead_of_numbers
 from mkc_torch.diagnosis.search.beam import BeamSearch
 from mkc_torch.diagnosis.search.candidate import Candidate
 from mkc_torch.diagnosis.search.move_fits import fitted_without
-from mkc_torch.diagnosis.search.moves import additions
+from mkc_torch.diagnosis.search.moves import additions, with_wide_grid
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.diagnosis.thresholds import IMPLAUSIBLE
 from mkc_torch.effects import CATALOGUE
@@ -25,6 +25,7 @@ from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.simulation import Parameter, Stepper
 from mkc_torch.simulation.dynamics.flow import changes_by_inputs
 from mkc_torch.simulation.logarithms import Logarithms
+from mkc_torch.simulation.names import Names
 from tests.simulation.stepped.models import Equations
 from tests.simulation.stepped.test_stepper import recording_of
 
@@ -178,3 +179,63 @@ def test_gains_leave_out_the_parameters_that_are_held():
     (addition,) = additions(alone, (term,), SETTINGS.noise)
     assert addition.gain == pytest.approx(0.5 * len(residual) * math.log(float(explained)), rel=1e-6)
     assert float(addition.starts[0][1]) == pytest.approx(float(residual.mean()), rel=1e-6)
+
+
+def replaced(stiffness):
+    """The model with effects in place of the fitted stiffness, and the model with the play alone."""
+    prepared = Servo().prepare(followed(gap=GAP, stiffness=stiffness))
+    terms = terms_of(prepared, "backlash", "input_lag", "input_delay")
+    play = replace(next(term for term in terms if term.effect.id == "backlash"), shape={"half_gap": GAP})
+    start = torch.cat([prepared.given, prepared.given.new_ones(1)])
+    start[0] = stiffness
+    final = fitted(JointModel(prepared, [play]), start, graduate=False)
+    beam = BeamSearch(terms, basis_of(final, 3, {}, SETTINGS), SETTINGS, {})
+    return instead_of_numbers(beam, final, with_wide_grid(terms, prepared)), final
+
+
+def test_a_late_command_takes_the_place_of_a_servo_that_is_far_too_soft():
+    found, final = replaced(STIFFNESS / 15.0)
+    assert found is not None
+    assert found.values == {"stiffness": STIFFNESS}
+    assert float(found.model.fit.parameters[0]) == pytest.approx(STIFFNESS, rel=1e-9)
+    assert {term.effect.id for term in found.more} <= {"input_lag", "input_delay"}
+    assert found.more
+    assert found.more == found.model.fit.model.terms[1:]
+    # a servo without inertia follows late by the ratio of its damping to its stiffness
+    lags = [sum(term.shape.values()) for term in found.more]
+    assert sum(lags) == pytest.approx(1.5 / (STIFFNESS / 15.0) - 1.5 / STIFFNESS, rel=0.3)
+    assert found.model.log_size < float(final.residual.square().mean().sqrt().log()) + 1.0
+
+
+def test_nothing_takes_the_place_of_a_likely_number():
+    assert replaced(STIFFNESS)[0] is None
+
+
+@pytest.mark.e2e
+def test_the_diagnosis_tells_what_takes_the_place_of_an_unlikely_number():
+    effects = [effect for effect in CATALOGUE if effect.id in ("backlash", "input_lag")]
+    recording = followed(gap=GAP, stiffness=STIFFNESS / 15.0, samples=150)
+    found = diagnose(Servo(), recording, effects=effects, surrogates=19, seed=0)
+    assert [finding.effect for finding in found.findings] == ["backlash"]
+    (check,) = found.checks
+    assert "With `stiffness` at 60, the values given, the search finds input lag on the input command (lag" in (
+        check.sentence
+    )
+
+
+def test_a_parameter_is_the_same_at_all_samples():
+    """So a recorded column drives none, and the ports have none."""
+    assert not [name for name in Servo().prepare(followed()).ports if name.startswith("parameter")]
+    x, u = (Names(**{name: torch.zeros(5) for name in names}) for names in (Servo.states, Servo.inputs))
+    p = Names(stiffness=torch.full((5,), STIFFNESS))
+    with pytest.raises(ValueError, match=r"expected \(p,\), a number for each, got \(1, 5\)"):
+        Servo().derivative(torch.zeros(5), x, u, p)
+
+
+@pytest.mark.e2e
+def test_a_recorded_column_next_to_the_command_stops_no_search():
+    own = followed(gap=GAP)
+    columns = {name: own[name] for name in ("time", "command", "angle")}
+    recording = Recording({**columns, "temperature": 20.0 + torch.sin(own["time"])})
+    found = diagnose(Servo(), recording, quick=True, effects=[e for e in CATALOGUE if e.id in ("backlash", "gain")])
+    assert not [warning for warning in found.warnings if "internal error" in warning]
