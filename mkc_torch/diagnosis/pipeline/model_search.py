@@ -390,7 +390,7 @@ def _instead(final: FittedModel, beam: BeamSearch) -> str:
     compared = f"{gap:.0f} nats less" if gap > 0.0 else f"{-gap:.0f} nats more"
     return (
         f"With {values}, the values given, the search finds {effects} in addition; the open-loop residual is then "
-        f"{reached}, and the score is {compared}. Only a measurement of the number tells the two explanations apart."
+        f"{reached}, and the score is {compared}. Only a measurement of the number distinguishes the two."
     )
 
 

@@ -67,7 +67,7 @@ def instead_of_numbers(beam: Models, final: FittedModel, terms: Sequence[Term]) 
     """Return the model in which effects take the place of the unlikely numbers of a model; None where it has none.
 
     A servo that is too soft follows late, and so does a servo with a delay: the recording may prefer the number, and
-    only its measurement tells them apart.
+    only its measurement distinguishes the two.
 
     Args:
         beam: the search that found the model.

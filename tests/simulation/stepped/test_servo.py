@@ -212,7 +212,7 @@ def test_nothing_takes_the_place_of_a_likely_number():
 
 
 @pytest.mark.e2e
-def test_the_diagnosis_tells_what_takes_the_place_of_an_unlikely_number():
+def test_effects_in_place_of_an_unlikely_number_are_named():
     effects = [effect for effect in CATALOGUE if effect.id in ("backlash", "input_lag")]
     recording = followed(gap=GAP, stiffness=STIFFNESS / 15.0, samples=150)
     found = diagnose(Servo(), recording, effects=effects, surrogates=19, seed=0)
