@@ -112,8 +112,6 @@ class Effect(ABC):
         plot_axis: part of the signal over which its curve is drawn; default none.
         reduces_to: a special case of this effect, or its form to first order, with no more numbers, whose shape is a
             part of this effect's shape; default None.
-        instead_of: id of a simpler effect at the same port that acts alike; this effect is tried only where its linear
-            gain is the larger of both. Default none.
         simpler: the same physics with fewer numbers in γ, each shared by several consecutive numbers of this effect's
             γ, and with the same shapes. It is preferred where it predicts unseen blocks as well. Default None.
 
@@ -148,7 +146,6 @@ class Effect(ABC):
     needs: tuple[str, ...] = ()
     excludes: tuple[str, ...] = ()
     reduces_to: Effect | None = None
-    instead_of: str = ""
     roles: tuple[str, ...] = ()
     driver_kinds: tuple[Kind, ...] = ()
     positive_driver: bool = False

@@ -104,14 +104,12 @@ class BeamSearch:
         expanded: set[ModelKey] = set()
         held: set[ModelKey] = set()
         most = self.most_models - int(IMPROVING * self.most_models)
-        while len(self.models) < most:
-            waiting = [(rank, model) for rank, model in enumerate(self.beam()) if model.key not in expanded]
-            if not waiting:
-                break
+        whole = True
+        while whole and (waiting := [pair for pair in enumerate(self.beam()) if pair[1].key not in expanded]):
             for rank, model in waiting:
-                if len(self.models) < most:
+                whole = whole and self._expand(model, rank, terms, further, most)
+                if whole:
                     expanded.add(model.key)
-                    self._expand(model, rank, terms, further, most)
             self._hold_best(held)
         self._improve(terms, further, expanded)
         self._under_noise()
@@ -200,8 +198,8 @@ class BeamSearch:
         own, others_score = (score(model, self.basis, self.settings) for model in (found, other))
         return found if separation(own, others_score, self.basis) > self.settings.naming.separable else None
 
-    def _expand(self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term], most: int) -> None:
-        """Fit and score the models that one move leads to, up to a number of models in all."""
+    def _expand(self, model: Candidate, rank: int, terms: Sequence[Term], further: Sequence[Term], most: int) -> bool:
+        """Fit and score the models that one move leads to, up to a number of models in all; return whether all are."""
         fit, have = model.fit, len(model.fit.model.terms)
         works: list[tuple[ModelKey, str, Callable[[], FittedModel | None]]] = []
         if have < self.most_terms and not any(term.effect.is_curve for term in fit.model.terms):
@@ -229,7 +227,7 @@ class BeamSearch:
                 works.append((model_key([*rest, other]), move, work))
         orders = in_other_orders(fit)
         works += [(model_key(o), "another order in series", partial(fitted_reordered, fit, o)) for o in orders]
-        self._fit(works, fit, most)
+        return self._fit(works, fit, most)
 
     def _hold_best(self, held: set[ModelKey]) -> None:
         """Exchange the holds of the inputs of the best model, and if that scores higher those of all other models.
@@ -347,8 +345,8 @@ class BeamSearch:
 
     def _fit(
         self, works: Sequence[tuple[ModelKey, str, Callable[[], FittedModel | None]]], near: FittedModel, most: int
-    ) -> None:
-        """Fit and score models that are not known yet, in parallel, up to a number of models in all."""
+    ) -> bool:
+        """Fit and score unknown models in parallel, up to a number of models in all; return whether that allows all."""
         new: dict[ModelKey, tuple[str, list[Callable[[], FittedModel | None]]]] = {}
         for key, move, work in works:
             if key in new:
@@ -360,6 +358,7 @@ class BeamSearch:
             report_bound("model", len(self.models), self.most_models)
         found = run_parallel(tried, near.model.prepared, self.terms, "model")
         self.keep([model for model in found if model is not None])
+        return all(key in self.models or key in new for key, _, _ in works)
 
     def score_of(self, fit: FittedModel) -> Score | None:
         """Return the score of a fit; it is computed once."""

@@ -273,8 +273,7 @@ def one_form_each(found: Sequence[Addition], worth: Callable[[Addition], float])
     for all recordings, unless another form is worth more.
 
     Otherwise the forms of one effect would take the places of other effects. A further form whose special case is not
-    among the additions comes only in exchange. An effect that acts like a simpler one is left out where that is worth
-    as much.
+    among the additions comes only in exchange.
 
     Args:
         found: the additions.
@@ -291,8 +290,7 @@ def one_form_each(found: Sequence[Addition], worth: Callable[[Addition], float])
         if first:
             best = max(members, key=worth)
             chosen.append(best if worth(best) > worth(first[0]) + _BETTER else first[0])
-    at = {(a.starts[0][0].effect.id, a.starts[0][0].port): worth(a) for a in chosen}
-    return [a for a in chosen if worth(a) > at.get((a.starts[0][0].effect.instead_of, a.starts[0][0].port), -math.inf)]
+    return chosen
 
 
 def in_other_orders(fit: FittedModel) -> list[tuple[Term, ...]]:

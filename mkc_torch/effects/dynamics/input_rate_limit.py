@@ -34,7 +34,6 @@ class InputRateLimit(ShareEffect):
 
     id = "input_rate_limit"
     remembers = True
-    instead_of = "input_lag"
     needs = ("own", "pace")
     relative: Mapping[str, tuple[str, str]] = {"rate": ("pace", "largest")}
     fitted_shape: Mapping[str, tuple[float, float]] = {"rate": (0.001, 0.99)}

@@ -132,6 +132,18 @@ def test_no_more_models_are_tried_than_allowed(most):
     assert len(beam.models) == most
 
 
+def test_moves_that_the_number_of_models_cuts_off_are_made_while_the_best_is_improved():
+    """Of the moves from the best model with one effect, the first part of the search has room for one."""
+    fit = start(DRAG, FRICTION)
+    names = ("linear_drag", "stribeck_friction", "constant_force", "quadratic_drag", "unknown")
+    beam = beam_of(fit, cart_terms(fit, *names), most_models=10, most_terms=3)
+    beam.run(fit)
+    moves = [model.move for model in beam.models.values()]
+    assert "add unknown@speed" in moves[6]
+    assert "add quadratic_drag@speed" in moves[7:]
+    assert {"quadratic_drag", "stribeck_friction"} < effects_of(beam.best)
+
+
 def test_no_model_has_more_effects_than_allowed():
     fit = start(DRAG, FRICTION)
     beam = beam_of(fit, cart_terms(fit, "quadratic_drag", "constant_force"), most_terms=1)
