@@ -21,7 +21,7 @@ from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.first_fit import multiple_shooting_start, with_strong_observer
 from mkc_torch.simulation.dynamics.first_observed import first_observed
 from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, most_likely_noise
-from mkc_torch.simulation.dynamics.other_starts import other_starts
+from mkc_torch.simulation.dynamics.other_starts import at_other_scales, log_size_at, other_starts
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.ports import Nearby
 from mkc_torch.simulation.protocol import PreparedSimulation
@@ -142,10 +142,11 @@ def fit_alone(
             return fit_with_process_noise(_wider(fitted(model, starts[0]), settings), declared, settings, model=model)
         except NoFitError as error:
             raise NoFitError(no_first_fit(prepared)) from error
-    # the numbers of a simulation that steps are near, by their prior, and its steps are dear
+    # the steps of a simulation that steps are dear: single numbers at other scales instead of shorter horizons
     short = None if system.system.steps is not None else multiple_shooting_start(system, system.given)
     starts += [] if short is None else [short]
-    free = _best_open_loop(model, starts)
+    scales = [] if system.system.steps is None else _best_scale(system, starts[0])
+    free = _best_open_loop(model, [*starts, *scales])
     if free is not None:
         keep(ProcessNoiseFit(free, free, None, len(starts)))
     if free is not None and _explains(free):
@@ -161,6 +162,14 @@ def fit_alone(
     except NoFitError as error:
         raise NoFitError(no_first_fit(prepared, others)) from error
     return replace(found, starts=len(starts) + others.tried + len(further))
+
+
+def _best_scale(system: PreparedDynamics, start: Float[Tensor, " p"]) -> list[Float[Tensor, " p"]]:
+    """Return the user's values with the number at another scale that leaves less than the start; else nothing."""
+    tried = [start, *at_other_scales(system)]
+    sizes = run_parallel([partial(log_size_at, system, theta) for theta in tried], system)
+    best = min(range(len(tried)), key=lambda number: sizes[number])
+    return [tried[best]] if best else []
 
 
 def _best_open_loop(model: JointModel, starts: Sequence[Float[Tensor, " p"]]) -> FittedModel | None:

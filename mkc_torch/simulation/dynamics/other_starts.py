@@ -1,8 +1,9 @@
-"""Further starts after a failed first fit: the user's values, and values between and around them."""
+"""Further starts of a first fit: other scales of a number, and after a failure values between and around the user's."""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -21,6 +22,9 @@ _BETWEEN = (0.25, 0.5, 0.75)
 
 _FACTORS = (-1.0, 0.1, 10.0, 0.03, 30.0, 0.3, 3.0, 0.0)
 """Factors that a single parameter, or all of them, are multiplied by."""
+
+_SCALES = (1.0 / 32.0, 1.0 / 8.0, 8.0)
+"""Factors that a positive number with an uncertainty is multiplied by; its own is mostly a factor of two."""
 
 _MOST_TRIED = 60
 """Number of starts that are simulated at most."""
@@ -61,7 +65,6 @@ def other_starts(prepared: PreparedDynamics, start: Float[Tensor, " p"], count: 
         count: number of starts to return at most.
     """
     free, given = prepared.observed(None), prepared.given
-    variation = robust_scale(free.measured - free.measured.median(0).values).clamp(min=1e-300)
     usable: list[tuple[float, Tensor]] = []
     output, until, best, tried = "", 0.0, (-1, 0.0, -1.0), 0
     for number, theta in itertools.islice(_distinct(prepared, start), _MOST_TRIED):
@@ -75,12 +78,46 @@ def other_starts(prepared: PreparedDynamics, start: Float[Tensor, " p"], count: 
         if number >= 0 and lasts > best[2]:
             best = number, float(theta[number]), lasts
         if not len(rows):
-            usable.append((float((robust_scale(residual) / variation).clamp(min=1e-300).log().sum()), theta))
+            usable.append((_log_size(free, residual), theta))
     usable.sort(key=lambda pair: pair[0])
     starts = tuple(theta for _, theta in usable[:count])
     if not output or best[2] <= until:
         return OtherStarts(starts, tried, output, until)
     return OtherStarts(starts, tried, output, until, prepared.parameter_names[best[0]], *best[1:])
+
+
+def at_other_scales(prepared: PreparedDynamics) -> list[Float[Tensor, " p"]]:
+    """Return the user's values with one positive number at another scale each.
+
+    A servo given ten times too stiff holds its largest force all the time: then the residual hardly depends on its
+    stiffness, and a fit from there ends at a stiffness that is larger still.
+
+    Args:
+        prepared: the simulation; only numbers with an uncertainty, which are fitted, are changed.
+    """
+    low, high = prepared.bounds
+    found = []
+    for number, known in enumerate(prepared.known.values()):
+        if known.uncertainty is None or known.lower != 0.0 or not known.value > 0.0:
+            continue
+        for factor in _SCALES:
+            theta = prepared.given.clone()
+            theta[number] = factor * theta[number]
+            if bool(low[number] < theta[number]) and bool(theta[number] < high[number]):
+                found.append(theta)
+    return found[:_MOST_TRIED]
+
+
+def log_size_at(prepared: PreparedDynamics, theta: Float[Tensor, " p"]) -> float:
+    """Return the logarithm of the open-loop residual's robust size, summed over the outputs; infinite if it is lost."""
+    free = prepared.observed(None)
+    residual = free.residual(theta, {}).detach()
+    return _log_size(free, residual) if bool(residual.isfinite().all()) else math.inf
+
+
+def _log_size(prepared: PreparedDynamics, residual: Float[Tensor, "N m"]) -> float:
+    variation = robust_scale(prepared.measured - prepared.measured.median(0).values).clamp(min=1e-300)
+    return float((robust_scale(residual) / variation).clamp(min=1e-300).log().sum())
 
 
 def _distinct(prepared: PreparedDynamics, start: Tensor) -> Iterator[tuple[int, Tensor]]:
