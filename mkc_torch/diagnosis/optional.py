@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import NamedTuple, TypeVar
 
+from mkc_torch.nonlinear import NoFitError
+
 T = TypeVar("T")
 
 
@@ -72,7 +74,11 @@ def failure(step: str, error: Exception) -> str:
     Example:
         >>> failure("counting", RuntimeError("sizes differ")).partition(";")[0]
         "The step 'counting' ended in an internal error (RuntimeError: sizes differ)"
+        >>> failure("counting", NoFitError("No fit is finite."))
+        "The step 'counting' has no result: No fit is finite."
     """
+    if isinstance(error, NoFitError):
+        return f"The step '{step}' has no result: {_in_one_line(error)}"
     return (
         f"The step '{step}' ended in an internal error ({type(error).__name__}: {_in_one_line(error)}); the result "
         "is that before it. Please report this."

@@ -38,6 +38,12 @@ _FIRST = 3
 _OTHER_STARTS = 3
 """Number of further starts for fits, if the first starts fail."""
 
+_SCALED = 3
+"""Numbers, one after the other, of which other scales are tried."""
+
+_SMALLER = 0.05
+"""Logarithm of the residual's size by which another scale has to leave less."""
+
 _NOTHING = 0.05
 """Explained share of the outputs' variation up to which a first fit is poor."""
 
@@ -165,11 +171,20 @@ def fit_alone(
 
 
 def _best_scale(system: PreparedDynamics, start: Float[Tensor, " p"]) -> list[Float[Tensor, " p"]]:
-    """Return the user's values with the number at another scale that leaves less than the start; else nothing."""
-    tried = [start, *at_other_scales(system)]
-    sizes = run_parallel([partial(log_size_at, system, theta) for theta in tried], system)
-    best = min(range(len(tried)), key=lambda number: sizes[number])
-    return [tried[best]] if best else []
+    """Return the user's values with numbers at other scales, one after the other, if that leaves less than the start.
+
+    Returns:
+        A start, or none.
+    """
+    best, least, at = None, log_size_at(system, start), system.given
+    for _ in range(_SCALED):
+        tried = at_other_scales(system, at)
+        sizes = run_parallel([partial(log_size_at, system, theta) for theta in tried], system)
+        if not sizes or not min(sizes) < least - _SMALLER:
+            break
+        least = min(sizes)
+        best = at = tried[sizes.index(least)]
+    return [] if best is None else [best]
 
 
 def _best_open_loop(model: JointModel, starts: Sequence[Float[Tensor, " p"]]) -> FittedModel | None:

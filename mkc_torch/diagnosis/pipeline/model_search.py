@@ -111,24 +111,38 @@ def search_models(
         return replace(search, left=(), column=column)
     if first.p_value > options.level:
         follow = _follow(beam) if not options.quick else ()
-        return replace(search, left=(), first=replace(first, follow=follow))
-    progress("testing the effects of the best models")
-    p_values = _PValues(others, line, lines)
-    tested = partial(
-        _tested, search, p_values=p_values, beam=beam, base=base, options=options, generator=generator, keep=keep
-    )
-    for chain in [*chains_to_test(beam), *chain_of_line(beam)]:
-        if others > options.level and not chain[0].fit.model.terms[0].effect.by_periodogram:
-            continue
+        found = replace(search, left=(), first=replace(first, follow=follow))
+    else:
+        progress("testing the effects of the best models")
+        p_values = _PValues(others, line, lines)
+        tested = partial(
+            _tested, search, p_values=p_values, beam=beam, base=base, options=options, generator=generator, keep=keep
+        )
+        chains = [
+            chain
+            for chain in [*chains_to_test(beam), *chain_of_line(beam)]
+            if others <= options.level or chain[0].fit.model.terms[0].effect.by_periodogram
+        ]
+        found = _first_confirmed(chains, search, beam, tested)
+    final = found.found[-1].fit if found.found else _start(base)
+    work = partial(_instead, final, beam, quick=options.quick)
+    progress("comparing with the values given")
+    return replace(found, instead=optional("comparing with the values given", work, lambda: ""))
+
+
+def _first_confirmed(
+    chains: Sequence[Sequence[Candidate]],
+    search: StepwiseSearch,
+    beam: BeamSearch,
+    tested: Callable[[Sequence[Candidate]], StepwiseSearch],
+) -> StepwiseSearch:
+    """Test chains of models one after the other until held-out blocks confirm an effect or nothing is significant."""
+    for chain in chains:
         found = _in_either_way(chain, beam, tested)
         # the simpler model counts as a rival only if all its effects are significant
         if 0 < len(found.found) < len(chain) and beam.best.key != chain[-1].key:
             again = _in_either_way(chain_to(beam.best, beam), beam, tested)
             found = again if len(again.found) > len(found.found) else found
-        if found.found and not options.quick:
-            progress("comparing with the values given")
-            work = partial(_instead, found.found[-1].fit, beam)
-            return replace(found, instead=optional("comparing with the values given", work, lambda: ""))
         if found.found or not found.unconfirmed:
             return found
         search = replace(search, unconfirmed=search.unconfirmed or found.unconfirmed)
@@ -372,10 +386,10 @@ def _refused(before: Evidence, after: Evidence, search: StepwiseSearch, options:
     return gain_interval(difference, search.blocks.block, generator)[1][1] < 0.0
 
 
-def _instead(final: FittedModel, beam: BeamSearch) -> str:
+def _instead(final: FittedModel, beam: BeamSearch, *, quick: bool) -> str:
     """Return the effects that take the place of a model's unlikely numbers in sentences; empty if none do."""
     wide = with_wide_grid(beam.terms, final.model.prepared.open_loop())
-    found = instead_of_numbers(beam, final, wide)
+    found = instead_of_numbers(beam, final, wide, quick=quick)
     if found is None:
         return ""
     values = " and ".join(f"`{name}` at {value:.4g}" for name, value in found.values.items())

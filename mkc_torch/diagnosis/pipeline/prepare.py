@@ -12,6 +12,7 @@ from mkc_torch._support.arguments import checked_number, checked_whole, format_v
 from mkc_torch._support.arrays import is_frame
 from mkc_torch.diagnosis.declared import checked_input_hold, checked_noise
 from mkc_torch.diagnosis.model.suspect import refuse_unknown
+from mkc_torch.diagnosis.pipeline.stretch import quick_stretch
 from mkc_torch.diagnosis.settings import Settings, quick_settings
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.given_columns import EXPERIMENT
@@ -95,6 +96,8 @@ def prepare(
     _refuse_no_progress(progress)
     progress("reading the recording")
     prepared = simulation.prepare(recording)
+    stretch = quick_stretch(prepared, recording) if options.quick else None
+    prepared = prepared if stretch is None else simulation.prepare(stretch)
     _refuse_few(prepared)
     if len(prepared.time) < options.settings.search.fewest_samples:
         options = replace(options, quick=True, max_findings=0, suspect=(), too_few=True)

@@ -17,6 +17,7 @@ from mkc_torch.diagnosis.search.along_noise import Models
 from mkc_torch.diagnosis.search.candidate import Candidate
 from mkc_torch.diagnosis.search.move_fits import fitted_with
 from mkc_torch.diagnosis.search.moves import additions, one_form_each
+from mkc_torch.diagnosis.thresholds import MOST_TERMS
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.unlikely import is_unlikely
 
@@ -63,7 +64,9 @@ class AtGivenValues:
     more: tuple[Term, ...]
 
 
-def instead_of_numbers(beam: Models, final: FittedModel, terms: Sequence[Term]) -> AtGivenValues | None:
+def instead_of_numbers(
+    beam: Models, final: FittedModel, terms: Sequence[Term], *, quick: bool = False
+) -> AtGivenValues | None:
     """Return the model in which effects take the place of the unlikely numbers of a model; None where it has none.
 
     A servo that is too soft follows late, and so does a servo with a delay: the recording may prefer the number, and
@@ -73,6 +76,7 @@ def instead_of_numbers(beam: Models, final: FittedModel, terms: Sequence[Term]) 
         beam: the search that found the model.
         final: the model.
         terms: the candidates, with the shapes of their grids.
+        quick: fit only the effect with the largest linear gain at each step.
     """
     free = final if final.open_loop is None else final.open_loop
     values: dict[str, float] = {}
@@ -82,8 +86,8 @@ def instead_of_numbers(beam: Models, final: FittedModel, terms: Sequence[Term]) 
         held = _held_at(held, values)
     known = len(free.model.terms)
     better = held if values else None
-    while better is not None and len(better.model.terms) < min(beam.most_terms, known + _MOST):
-        held, better = better, _with_one_more(better, beam, terms)
+    while better is not None and len(better.model.terms) < min(MOST_TERMS, known + _MOST):
+        held, better = better, _with_one_more(better, beam, terms, 1 if quick else _TRIED)
     held = held if better is None else better
     more = () if held is None else held.model.terms[known:]
     model = beam.scored("hold unlikely numbers", lambda: held) if more else None
@@ -113,13 +117,13 @@ def _held_at(fit: FittedModel, values: Mapping[str, float]) -> FittedModel | Non
     return _fitted(JointModel(held, fit.model.terms, fit.model.near), fit, start)
 
 
-def _with_one_more(held: FittedModel, beam: Models, terms: Sequence[Term]) -> FittedModel | None:
-    """Return the fit with the further effect that is worth most; None where none is worth its price."""
+def _with_one_more(held: FittedModel, beam: Models, terms: Sequence[Term], tried: int = _TRIED) -> FittedModel | None:
+    """Return the fit with the further effect that is worth most, of a number; None where none is worth its price."""
     named = [term for term in terms if not term.effect.is_curve]
     found = one_form_each(additions(held, named, beam.settings.noise), beam.worth)
-    found = [one for one in sorted(found, key=beam.worth, reverse=True)[:_TRIED] if beam.worth(one) > 0.0]
-    tried = run_parallel([partial(fitted_with, held, one) for one in found], held.model.prepared, beam.terms)
-    best = max(tried, key=partial(_worth, beam=beam), default=held)
+    found = [one for one in sorted(found, key=beam.worth, reverse=True)[:tried] if beam.worth(one) > 0.0]
+    fits = run_parallel([partial(fitted_with, held, one) for one in found], held.model.prepared, beam.terms)
+    best = max(fits, key=partial(_worth, beam=beam), default=held)
     return best if _worth(best, beam) > _worth(held, beam) else None
 
 

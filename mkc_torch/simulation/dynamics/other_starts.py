@@ -86,14 +86,15 @@ def other_starts(prepared: PreparedDynamics, start: Float[Tensor, " p"], count: 
     return OtherStarts(starts, tried, output, until, prepared.parameter_names[best[0]], *best[1:])
 
 
-def at_other_scales(prepared: PreparedDynamics) -> list[Float[Tensor, " p"]]:
-    """Return the user's values with one positive number at another scale each.
+def at_other_scales(prepared: PreparedDynamics, values: Float[Tensor, " p"]) -> list[Float[Tensor, " p"]]:
+    """Return parameters with one positive number at another scale each.
 
     A servo given ten times too stiff holds its largest force all the time: then the residual hardly depends on its
     stiffness, and a fit from there ends at a stiffness that is larger still.
 
     Args:
         prepared: the simulation; only numbers with an uncertainty, which are fitted, are changed.
+        values: (p,), the parameters.
     """
     low, high = prepared.bounds
     found = []
@@ -101,7 +102,7 @@ def at_other_scales(prepared: PreparedDynamics) -> list[Float[Tensor, " p"]]:
         if known.uncertainty is None or known.lower != 0.0 or not known.value > 0.0:
             continue
         for factor in _SCALES:
-            theta = prepared.given.clone()
+            theta = values.clone()
             theta[number] = factor * theta[number]
             if bool(low[number] < theta[number]) and bool(theta[number] < high[number]):
                 found.append(theta)
