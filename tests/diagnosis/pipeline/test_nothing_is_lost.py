@@ -49,10 +49,13 @@ def folder(tmp_path_factory):
     return place
 
 
-def diagnosed(folder, output):
+WHOLE = ("--surrogates", 19, "--max-findings", 1)
+
+
+def diagnosed(folder, output, options=WHOLE):
     """Return the result of the command, and the content of diagnosis.json."""
-    options = ("--simulation", f"{folder / 'vehicle.py'}:Vehicle", "--input-hold", "force=held", "--surrogates", 19)
-    result = mkc("diagnose", folder / "run.csv", *options, "--output", output, "--max-findings", 1)
+    of_vehicle = ("--simulation", f"{folder / 'vehicle.py'}:Vehicle", "--input-hold", "force=held")
+    result = mkc("diagnose", folder / "run.csv", *of_vehicle, *options, "--output", output)
     file = output / "run" / "diagnosis.json"
     return result, json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
 
@@ -118,7 +121,7 @@ def test_an_error_of_any_optional_step_leaves_all_files(folder, tmp_path, monkey
 )
 def test_a_file_whose_text_fails_is_missing_and_the_others_are_written(folder, tmp_path, monkeypatch, name, function):
     monkeypatch.setattr(function, broken)
-    result, content = diagnosed(folder, tmp_path)
+    result, content = diagnosed(folder, tmp_path, ["--quick"])
     assert result.exit_code == 3, result.output
     assert written(tmp_path) == ALL - {name}
     warning = f"The step 'writing {name}' ended in an internal error"
@@ -129,8 +132,8 @@ def test_a_file_whose_text_fails_is_missing_and_the_others_are_written(folder, t
 @pytest.mark.e2e
 def test_an_error_of_the_summary_leaves_the_files(folder, tmp_path, monkeypatch):
     monkeypatch.setattr("mkc_torch.cli.diagnosis_files.show", broken)
-    result, content = diagnosed(folder, tmp_path)
-    assert (result.exit_code, content["verdict"]) == (3, "explained")
+    result, content = diagnosed(folder, tmp_path, ["--quick"])
+    assert (result.exit_code, content["verdict"]) == (3, "unexplained")
     assert "The step 'printing the summary' ended in an internal error" in " ".join(result.output.split())
     assert written(tmp_path) == ALL
 
