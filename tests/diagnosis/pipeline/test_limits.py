@@ -14,12 +14,14 @@ from mkc_torch._parallel.pool import allow_copies
 from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
 from mkc_torch.diagnosis.result import Stop, notices
 from mkc_torch.diagnosis.search.significance import pays, price
+from mkc_torch.effects import CATALOGUE
 from mkc_torch.recording.demonstration import concealed_recording
 from mkc_torch.report import diagnosis_report
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.test_dynamics_diagnosis import Pendulum, pendulum_recording
 
-QUICK = {"surrogates": 19, "max_findings": 1}
+EFFECTS = [effect for effect in CATALOGUE if effect.id in ("quadratic_drag", "coulomb_friction", "current_field")]
+QUICK = {"surrogates": 19, "max_findings": 1, "effects": EFFECTS}
 NOT_FINISHED = "The search was stopped"
 
 
