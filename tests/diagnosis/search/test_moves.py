@@ -11,7 +11,6 @@ from mkc_torch import Recording
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import candidates_of
-from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.moves import (
     STARTS,
     Addition,
@@ -26,8 +25,6 @@ from mkc_torch.diagnosis.search.moves import (
 )
 from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 from mkc_torch.effects import CATALOGUE
-from mkc_torch.effects.dynamics.input_lag import InputLag
-from mkc_torch.effects.dynamics.input_rate_limit import InputRateLimit
 from mkc_torch.simulation import Dynamics, Parameter
 from tests.diagnosis.cart import DRAG, FRICTION, SAMPLES, STEP, Cart, cart_terms, first_term, fit_with, free_fit
 
@@ -246,18 +243,6 @@ def test_one_form_of_a_dependence_is_added(gains, chosen):
     found = [Addition(((first[name], torch.zeros(1)),), gain) for name, gain in worth.items()]
     kept = one_form_each(found, lambda addition: addition.gain)
     assert {addition.starts[0][0].effect.id for addition in kept} == chosen
-
-
-@pytest.mark.parametrize(
-    ("lag", "limit", "kept"), [(9.0, 5.0, {"input_lag"}), (5.0, 9.0, {"input_lag", "input_rate_limit"})]
-)
-def test_an_effect_that_acts_like_a_simpler_one_is_added_where_it_is_worth_more(lag, limit, kept):
-    terms = (
-        (Term(InputLag(), None, {"lag": 0.1}, "input torque"), lag),
-        (Term(InputRateLimit(), None, {"rate": 1.0}, "input torque"), limit),
-    )
-    found = [Addition(((term, torch.zeros(1)),), gain) for term, gain in terms]
-    assert {a.starts[0][0].effect.id for a in one_form_each(found, lambda addition: addition.gain)} == kept
 
 
 def test_an_effect_in_series_with_a_lag_has_another_order():
