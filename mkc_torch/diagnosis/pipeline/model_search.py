@@ -402,8 +402,9 @@ def _instead(final: FittedModel, beam: BeamSearch, *, quick: bool) -> str:
     own = beam.value_of(_free(final))
     gap = (own - found.model.value) / beam.basis.kappa
     compared = f"{gap:.0f} nats less" if gap > 0.0 else f"{-gap:.0f} nats more"
+    given = "the value given" if len(found.values) == 1 else "the values given"
     return (
-        f"With {values}, the values given, the search finds {effects} in addition; the open-loop residual is then "
+        f"With {values}, {given}, the search finds {effects} in addition; the open-loop residual is then "
         f"{reached}, and the score is {compared}. Only a measurement of the number distinguishes the two."
     )
 

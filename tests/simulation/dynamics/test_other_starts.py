@@ -1,4 +1,4 @@
-"""Further starts for a first fit that failed."""
+"""Further starts for a first fit: other scales of its numbers, and other values after a failure."""
 
 import numpy as np
 import pytest

@@ -218,7 +218,7 @@ def test_effects_in_place_of_an_unlikely_number_are_named():
     found = diagnose(Servo(), recording, effects=effects, surrogates=19, seed=0)
     assert [finding.effect for finding in found.findings] == ["backlash"]
     (check,) = found.checks
-    assert "With `stiffness` at 60, the values given, the search finds input lag on the input command (lag" in (
+    assert "With `stiffness` at 60, the value given, the search finds input lag on the input command (lag" in (
         check.sentence
     )
 
