@@ -99,6 +99,7 @@ class Score:
         terms: price of the choice of effects.
         disturbances: price of the disturbances of the noise.
         forms: price of forms that include others as special cases, and of curves without a name.
+        given: price of parameters that are far from the values given, by their uncertainties.
         noise: the noise that scores best.
         per_sample: (N,), log-likelihood of each sample, averaged over the horizons.
     """
@@ -108,6 +109,7 @@ class Score:
     terms: float
     disturbances: float
     forms: float
+    given: float
     noise: NoiseModel
     per_sample: Float[np.ndarray, " N"]
 
@@ -119,7 +121,7 @@ class Score:
     @property
     def value(self) -> float:
         """The score."""
-        return self.log_likelihood - self.numbers - self.terms - self.disturbances - self.forms
+        return self.log_likelihood - self.numbers - self.terms - self.disturbances - self.forms - self.given
 
 
 def basis_of(base: FittedModel, candidates: int, declared: Mapping[str, float], settings: Settings) -> ScoreBasis:
@@ -227,6 +229,7 @@ def score(fit: FittedModel, basis: ScoreBasis, settings: Settings, near: Sequenc
         basis.kappa * basis.choice * len(fit.model.terms),
         basis.kappa * settings.noise.disturbance_gain * disturbances,
         basis.kappa * forms,
+        -basis.kappa * fit.model.log_prior(fit.parameters),
         noise,
         per_sample(flow, noise, basis.horizons, basis.span),
     )

@@ -124,12 +124,33 @@ def test_white_noise_gives_the_ordinary_likelihood() -> None:
     assert found.per_sample.sum() == pytest.approx(expected, rel=1e-6)
 
 
+class Uncertain(Slide):
+    """The same body, whose stiffness was measured wrong."""
+
+    parameters = {"stiffness": Parameter(1.1, lower=0.0, uncertainty=0.01), "damping": Parameter(0.05, lower=0.0)}
+
+
+def test_a_parameter_far_from_its_value_costs_half_the_square_of_its_distance() -> None:
+    recording = recorded(0, friction=0.05)
+    found = []
+    for simulation in (Slide(), Uncertain()):
+        alone, friction = fits(simulation, recording)
+        basis = replace(basis_of(alone, 10, {}, Settings()), kappa=2.0)
+        away = (float(friction.parameters[0]) - 1.1) / 0.01
+        scored_fit = score(friction, basis, Settings())
+        assert scored_fit is not None
+        found.append((scored_fit.given, 2.0 * 0.5 * away**2))
+    assert found[0][0] == 0.0
+    assert found[1][0] == pytest.approx(found[1][1])
+    assert found[1][0] > 20.0
+
+
 def test_parts_add_up_to_the_score() -> None:
     _, friction = fits(Slide(), recorded(0, friction=0.05))
     basis = basis_of(friction, 10, {}, Settings())
     found = score(friction, basis, Settings())
     assert found is not None
-    prices = found.numbers + found.terms + found.disturbances + found.forms
+    prices = found.numbers + found.terms + found.disturbances + found.forms + found.given
     assert found.value == pytest.approx(sum(found.by_horizon) / len(found.by_horizon) - prices)
     assert found.numbers == pytest.approx(0.5 * basis.kappa * math.log(N))
     assert found.terms == pytest.approx(math.log(10))

@@ -22,7 +22,6 @@ from mkc_torch.functional import mkc_nll
 from mkc_torch.simulation.affine_rounds import fitted_in_rounds
 from mkc_torch.simulation.dynamics.missing import recorded_weight
 from mkc_torch.simulation.dynamics.other_starts import OtherStarts
-from mkc_torch.simulation.logarithms import log_density
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
@@ -226,12 +225,11 @@ def _fit(
     )
     by = by if logarithms is None else partial(logarithms.fit, by=by)
     rounds = partial(fitted_in_rounds, fit=by, weight=weight, tolerance=effort.tolerance, rounds=effort.rounds)
-    log_prior = partial(log_density, model.prior) if logarithms is None else logarithms.log_prior
-    known = rounds(way, start, reference=reference, log_prior=log_prior)
+    known = rounds(way, start, reference=reference, log_prior=model.log_prior)
     if known is None and begin is not None:
         model, start = begin(model, start)
         way = model.continuation()
-        known = rounds(way, start, log_prior=log_prior)
+        known = rounds(way, start, log_prior=model.log_prior)
     found = by(way, start) if known is None else known
     there = model.begun_with(way.near(found.theta))
     residual = (there.residual if known is None else way)(found.theta).detach()

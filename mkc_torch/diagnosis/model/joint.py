@@ -19,7 +19,7 @@ from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.waveforms import apply_basis, outer_product
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.simulation.continuation import CompiledResidual, Continuation, is_plain
-from mkc_torch.simulation.logarithms import Logarithms
+from mkc_torch.simulation.logarithms import Logarithms, log_density
 from mkc_torch.simulation.ports import Answer, Change, FreeChange, Nearby
 from mkc_torch.simulation.protocol import PreparedSimulation
 
@@ -77,6 +77,11 @@ class JointModel:
         places = torch.zeros(self.size, dtype=torch.bool)
         places[: len(known)] = torch.tensor(positive, dtype=torch.bool)
         return Logarithms(places, prior, bounds) if any(positive) else None
+
+    def log_prior(self, parameters: Float[Tensor, " p"]) -> float:
+        """The logarithm of the density of the parameters' prior, less its largest value; 0 without a prior."""
+        logarithms = self.logarithms
+        return log_density(self.prior, parameters) if logarithms is None else logarithms.log_prior(parameters)
 
     @property
     def _settled(self) -> frozenset[str]:

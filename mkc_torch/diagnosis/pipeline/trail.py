@@ -36,6 +36,7 @@ def scored_model(model: Candidate, beam: BeamSearch, *, chosen: bool = False) ->
         "terms": score.terms,
         "disturbances": score.disturbances,
         "forms": score.forms,
+        "given": score.given,
     }
     return ScoredModel(terms, model.move, score.value, parts, _noise(score, fit), _open_loop(fit), chosen)
 

@@ -41,7 +41,7 @@ def add_at_given_values(beam: Models, start: FittedModel, terms: Sequence[Term])
         terms: the candidates, with the shapes of their grids.
     """
     most = min(beam.most_terms, _MOST)
-    held = _held(start, beam.settings.search.ran_away) if most > 1 else None
+    _, held = _at_given(start) if most > 1 else ({}, None)
     while held is not None and len(held.model.terms) < most:
         several, held = bool(held.model.terms), _with_one_more(held, beam, terms)
         if several and held is not None:
@@ -79,13 +79,9 @@ def instead_of_numbers(
         quick: fit only the effect with the largest linear gain at each step.
     """
     free = final if final.open_loop is None else final.open_loop
-    values: dict[str, float] = {}
-    held: FittedModel | None = free
-    while held is not None and (far := unlikely_values(held).keys() - values.keys()):
-        values |= {name: value for name, value in unlikely_values(held).items() if name in far}
-        held = _held_at(held, values)
     known = len(free.model.terms)
-    better = held if values else None
+    values, held = _at_given(free)
+    better = held
     while better is not None and len(better.model.terms) < min(MOST_TERMS, known + _MOST):
         held, better = better, _with_one_more(better, beam, terms, 1 if quick else _TRIED)
     held = held if better is None else better
@@ -101,6 +97,16 @@ def unlikely_values(fit: FittedModel) -> dict[str, float]:
         return {}
     pairs = zip(system.known.items(), fit.parameters.tolist(), strict=False)
     return {name: known.value for (name, known), value in pairs if is_unlikely(system, known, value)}
+
+
+def _at_given(fit: FittedModel) -> tuple[dict[str, float], FittedModel | None]:
+    """Return the values given for all unlikely numbers of a fit, and the fit with these held; None without any."""
+    values: dict[str, float] = {}
+    held: FittedModel | None = fit
+    while held is not None and (far := {k: v for k, v in unlikely_values(held).items() if k not in values}):
+        values |= far
+        held = _held_at(held, values)
+    return values, held if values else None
 
 
 def _held_at(fit: FittedModel, values: Mapping[str, float]) -> FittedModel | None:
@@ -137,24 +143,6 @@ def _released(held: FittedModel, start: FittedModel) -> FittedModel | None:
     """Return the fit with all parameters free."""
     found = _fitted(JointModel(start.model.prepared, held.model.terms), held)
     return None if found is None else shape_fitted(found, SEARCH)
-
-
-def _held(fit: FittedModel, away: float) -> FittedModel | None:
-    """Return the fit with its parameters held, if one with a prior is far from its value; else None."""
-    system = fit.model.prepared.dynamics
-    if system is None:
-        return None
-    pairs = zip(system.known.values(), fit.parameters.tolist(), strict=False)
-    far = any(
-        known.uncertainty is not None and known.value > 0.0 and not known.value / away <= value <= known.value * away
-        for known, value in pairs
-    )
-    if not far:
-        return None
-    own, (low, high) = system.given[: len(system.known)], system.bounds
-    held = copy.copy(system)
-    held.bounds = torch.cat([own, low[len(own) :]]), torch.cat([own, high[len(own) :]])
-    return _fitted(JointModel(held), fit, torch.cat([own, fit.parameters[len(own) :]]))
 
 
 def _fitted(model: JointModel, like: FittedModel, start: torch.Tensor | None = None) -> FittedModel | None:
