@@ -10,6 +10,7 @@ import torch
 
 from mkc_torch.recording import Recording
 from mkc_torch.simulation import MjcfError, SimulationError, load_mjcf, load_simulation, mjcf_class
+from mkc_torch.simulation.names import Names
 from tests.simulation.stepped.models import PENDULUM, TWO_LINKS
 
 mujoco = pytest.importorskip("mujoco")
@@ -71,6 +72,30 @@ def test_the_simulation_is_that_of_mj_step(two_links):
     theta = prepared.given
     theta[-2:] = 0.0  # the recording starts at rest
     assert prepared.residual(theta, {}).abs().max() < 1e-9
+
+
+def test_steps_depend_on_nothing_that_was_computed_before(tmp_path):
+    """A step equals that of a file with the same numbers, after steps with other numbers, singly and in a batch."""
+    text = TWO_LINKS.replace('armature="0.01"', 'armature="0.05" frictionloss="0.4"')
+    (tmp_path / "arm.xml").write_text(text)
+    (tmp_path / "light.xml").write_text(text.replace("0.05", "0.002"))
+    arm, light = load_mjcf(tmp_path / "arm.xml"), load_mjcf(tmp_path / "light.xml")
+    engine, given, other = (
+        arm._engine,
+        *({name: p.value for name, p in model.parameters.items()} for model in (arm, light)),
+    )
+    x, u, tau = np.array([[0.1, 0.2, 0.3, 0.01]]), np.array([[0.3, 0.1]]), np.zeros((1, 2))
+    point = x[0].tolist(), u[0].tolist(), tau[0].tolist()
+    single, names = engine.single(), Names(**given)
+    first = engine.stepped(x, u, tau, given)[0][0]
+    np.testing.assert_array_equal(single(*point, names), first)
+    changed = engine.stepped(x, u, tau, other)[0][0]
+    expected = load_mjcf(tmp_path / "light.xml")._engine.stepped(x, u, tau, other)[0][0]
+    np.testing.assert_allclose(changed, expected, rtol=1e-9)
+    assert np.abs(changed - first).max() > 1e-3
+    np.testing.assert_array_equal(single(*point, names), first)
+    engine.stepped(x, u, tau, {**other, "lower_mass": 2.0})
+    np.testing.assert_array_equal(engine.stepped(x, u, tau, given)[0][0], first)
 
 
 def test_dry_friction_at_a_joint_is_close_to_the_friction_loss_of_mujoco(two_links):

@@ -54,7 +54,9 @@ class Engine:
         self._layout = _Layout.of(description)
         _hold_followed(self.model, self._layout)
         self._pools: dict[int, tuple[Any, list[Any]]] = {}
-        self._constants = tuple(known.parameter.value for known in description.constants.values())
+        self._scratch = mujoco.MjData(self.model)
+        self._written: tuple[float, ...] | None = None
+        self._single: Names | None = None
         self._size = mujoco.mj_stateSize(self.model, _STATE)
 
     def stepped(self, x: Array, u: Array, tau: Array, parameters: Mapping[str, float]) -> tuple[Array, Array]:
@@ -96,12 +98,11 @@ class Engine:
         moved = [*layout.followed, *(layout.joints + k for k in layout.followed)]
         forced = [first + layout.controls_in_all - layout.joints + k for k in layout.followed]
         after, heavy = np.empty(n), layout.heavy
-        set_up: list[Names] = []
 
         def step(x: Sequence[float], u: Sequence[float], tau: Sequence[float], p: Names) -> Sequence[float]:
-            if not set_up or set_up[0] is not p:
+            if self._single is not p:  # a batch of other parameters may have been between
                 self._set(vars(p))
-                set_up[:] = [p]
+                self._single = p
             row[own], row[drives] = x, (*u[:controls], *tau)
             if moved:
                 row[moved] = (*u[controls::3], *u[controls + 1 :: 3])
@@ -134,16 +135,24 @@ class Engine:
         return found, np.where(usable[:, None, None], sensed, np.nan)
 
     def _set(self, parameters: Mapping[str, float]) -> None:
-        """Write the numbers and constants, as in the file where they are not given, and what MuJoCo derives of them."""
-        for name, number in self.description.numbers.items():
-            number.write(self.model, parameters[name])
-        known = self.description.constants
-        values = tuple(parameters.get(name, constant.parameter.value) for name, constant in known.items())
-        if values != self._constants:
-            for constant, value in zip(known.values(), values, strict=True):
-                constant.write(self.model, value, self.description.model)
-            mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
-            self._constants = values
+        """Write the numbers and constants, as in the file where they are not given, and what MuJoCo derives of them.
+
+        MuJoCo's friction depends on weights that it derives of the inertias, so that these are derived every time.
+        """
+        self._single = None
+        numbers, known = self.description.numbers, self.description.constants
+        values = (
+            *(parameters[name] for name in numbers),
+            *(parameters.get(name, constant.parameter.value) for name, constant in known.items()),
+        )
+        if values == self._written:
+            return
+        for number, value in zip(numbers.values(), values, strict=False):
+            number.write(self.model, value)
+        for constant, value in zip(known.values(), values[len(numbers) :], strict=True):
+            constant.write(self.model, value, self.description.model)
+        mujoco.mj_setConst(self.model, self._scratch)
+        self._written = values
 
     @property
     def _pool(self) -> tuple[Any, list[Any]]:
