@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -36,6 +37,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 
+_KEPT = 8
+"""Number of past trajectories by own steps that are kept: a fit, its score and its tangents ask for the same."""
+
+
 def compiled_dynamics(system: Traceable, meaning: Meaning, size: int) -> CompiledDynamics | None:
     """Compile the residual of a prepared system; None where its functions cannot be traced.
 
@@ -62,6 +67,7 @@ class CompiledDynamics:
         self._recorded = None if missing is None else missing.recorded.numpy().T[:, None]
         self._nearest = None if missing is None else missing.nearest.numpy().T[:, None]
         self._measured = np.ascontiguousarray(system.measured.numpy().T)
+        self._trajectories: OrderedDict[tuple[float, ...], Array] = OrderedDict()
 
     def answer(self, parameters: Float[Tensor, " p"], near: Nearby | None = None) -> Answer:
         """Compute the residual; NaN where no trajectory is found from ``near`` nor from the first guess.
@@ -82,17 +88,26 @@ class CompiledDynamics:
 
     def _stepped(self, parameters: Tensor) -> tuple[Array, Factor | None] | None:
         """The states of a simulation that steps by its own steps; None where these are slow, or fail."""
+        if not self._grid.maps:
+            return None
+        key = tuple(parameters.tolist())
+        found = self._trajectories.pop(key, None)
+        found = self._by_own_steps(parameters) if found is None else found
+        if found is None:
+            return None
+        self._trajectories[key] = found
+        while len(self._trajectories) > _KEPT:
+            self._trajectories.popitem(last=False)
+        return found, None
+
+    def _by_own_steps(self, parameters: Tensor) -> Array | None:
         theta, changes = self._meaning(parameters)
         steps, values = self._system.system.steps, parameters.tolist()
         if self._steps is not None:
-            found = self._steps.states(values, self._first(values))
-        elif steps is not None and steps.alone and rolls_out(self._system, theta, changes):
-            found = self._plain_steps(theta, changes)
-        elif self._grid.maps:
-            found = in_sequence(self._traced, self._grid, values, self._first(values), self._rows, self._observed)
-        else:
-            return None
-        return None if found is None else (found, None)
+            return self._steps.states(values, self._first(values))
+        if steps is not None and steps.alone and rolls_out(self._system, theta, changes):
+            return self._plain_steps(theta, changes)
+        return in_sequence(self._traced, self._grid, values, self._first(values), self._rows, self._observed)
 
     def affine(self, parameters: Float[Tensor, " p"], near: Nearby) -> CompiledDynamics | None:
         """The residual with the simulation's own steps affine at a trajectory; None without steps, or where one fails.

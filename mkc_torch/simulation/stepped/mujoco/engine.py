@@ -93,20 +93,24 @@ class Engine:
         """A function for single steps in sequence."""
         layout, model, data = self._layout, self.model, mujoco.MjData(self.model)
         n, controls, row = layout.states_in_all, len(layout.controls), np.zeros(mujoco.mj_stateSize(model, _GIVEN))
-        own, first = layout.own.tolist(), n + layout.joints
-        drives = [first + place for place in (*layout.controls, *layout.forces)]
-        moved = [*layout.followed, *(layout.joints + k for k in layout.followed)]
-        forced = [first + layout.controls_in_all - layout.joints + k for k in layout.followed]
+        own, first = layout.own, n + layout.joints
+        places = np.array(
+            [
+                *own,
+                *(first + place for place in (*layout.controls, *layout.forces)),
+                *layout.followed,
+                *(layout.joints + k for k in layout.followed),
+                *(first + layout.controls_in_all - layout.joints + k for k in layout.followed),
+            ]
+        )
         after, heavy = np.empty(n), layout.heavy
 
         def step(x: Sequence[float], u: Sequence[float], tau: Sequence[float], p: Names) -> Sequence[float]:
             if self._single is not p:  # a batch of other parameters may have been between
                 self._set(vars(p))
                 self._single = p
-            row[own], row[drives] = x, (*u[:controls], *tau)
-            if moved:
-                row[moved] = (*u[controls::3], *u[controls + 1 :: 3])
-                row[forced] = [heavy * acceleration for acceleration in u[controls + 2 :: 3]]
+            forced = [heavy * acceleration for acceleration in u[controls + 2 :: 3]]
+            row[places] = [*x, *u[:controls], *tau, *u[controls::3], *u[controls + 1 :: 3], *forced]
             mujoco.mj_setState(model, data, row, _GIVEN)
             mujoco.mj_step(model, data)
             mujoco.mj_getState(model, data, after, _MOTION)
