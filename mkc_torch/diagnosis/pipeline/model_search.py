@@ -24,7 +24,6 @@ from mkc_torch.diagnosis.model.process_noise import (
 from mkc_torch.diagnosis.model.shapes import described, shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time
-from mkc_torch.diagnosis.optional import optional
 from mkc_torch.diagnosis.pipeline.chains import (
     chain_of_line,
     chain_to,
@@ -125,9 +124,8 @@ def search_models(
         ]
         found = _first_confirmed(chains, search, beam, tested)
     final = found.found[-1].fit if found.found else _start(base)
-    work = partial(_instead, final, beam, quick=options.quick)
     progress("comparing with the values given")
-    return replace(found, instead=optional("comparing with the values given", work, lambda: ""))
+    return replace(found, instead=_instead(final, beam))
 
 
 def _first_confirmed(
@@ -386,14 +384,13 @@ def _refused(before: Evidence, after: Evidence, search: StepwiseSearch, options:
     return gain_interval(difference, search.blocks.block, generator)[1][1] < 0.0
 
 
-def _instead(final: FittedModel, beam: BeamSearch, *, quick: bool) -> str:
-    """Return the effects that take the place of a model's unlikely numbers in sentences; empty if none do."""
-    wide = with_wide_grid(beam.terms, final.model.prepared.open_loop())
-    found = instead_of_numbers(beam, final, wide, quick=quick)
+def _instead(final: FittedModel, beam: BeamSearch) -> str:
+    """Return the effects that take the place of unlikely numbers in sentences; empty if none do."""
+    found = instead_of_numbers(beam, final, with_wide_grid(beam.terms, final.model.prepared.open_loop()))
     if found is None:
         return ""
     values = " and ".join(f"`{name}` at {value:.4g}" for name, value in found.values.items())
-    effects = " and ".join(_with_shape(term) for term in found.more)
+    effects = " and ".join(_with_shape(term) for term in found.model.fit.model.terms)
     sizes = size_of(found.model.fit.residual).tolist(), size_of(_free(final).residual).tolist()
     names = final.model.prepared.channels
     reached = ", ".join(
@@ -404,7 +401,7 @@ def _instead(final: FittedModel, beam: BeamSearch, *, quick: bool) -> str:
     compared = f"{gap:.0f} nats less" if gap > 0.0 else f"{-gap:.0f} nats more"
     given = "the value given" if len(found.values) == 1 else "the values given"
     return (
-        f"With {values}, {given}, the search finds {effects} in addition; the open-loop residual is then "
+        f"With {values}, {given}, the search finds {effects}; the open-loop residual is then "
         f"{reached}, and the score is {compared}. Only a measurement of the number distinguishes the two."
     )
 

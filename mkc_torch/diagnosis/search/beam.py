@@ -18,7 +18,7 @@ from mkc_torch.diagnosis.model.suspect import suspect_id
 from mkc_torch.diagnosis.model.term import Term, run_parallel
 from mkc_torch.diagnosis.score import Score, ScoreBasis, is_implausible, score, separation
 from mkc_torch.diagnosis.search.along_noise import TRIED, add_along_noise
-from mkc_torch.diagnosis.search.at_given_values import add_at_given_values
+from mkc_torch.diagnosis.search.at_given_values import AtGivenValues, add_at_given_values
 from mkc_torch.diagnosis.search.candidate import Candidate, ModelKey, in_order, model_key, place_of, predicts_better
 from mkc_torch.diagnosis.search.in_words import leading
 from mkc_torch.diagnosis.search.move_fits import (
@@ -76,6 +76,7 @@ class BeamSearch:
         most_models: largest number of models that the search tries.
         noisy: the simulation alone under its process noise; None without.
         fixed: inputs whose hold is known.
+        at_given: the model with unlikely numbers held at the values given; None without any.
     """
 
     terms: tuple[Term, ...]
@@ -87,6 +88,7 @@ class BeamSearch:
     most_models: int = MOST_MODELS
     noisy: FittedModel | None = None
     fixed: Mapping[str, str] = field(default_factory=dict)
+    at_given: AtGivenValues | None = None
     _running: bool = False
     _scores: dict[int, tuple[FittedModel, Score | None]] = field(default_factory=dict)
 
@@ -100,7 +102,7 @@ class BeamSearch:
         self._running = True
         self.keep([Candidate(start, score(start, self.basis, self.settings), "")])
         terms = with_wide_grid(self.terms, start.model.prepared)
-        add_at_given_values(self, start, terms)
+        self.at_given = add_at_given_values(self, start, terms)
         expanded: set[ModelKey] = set()
         held: set[ModelKey] = set()
         most = self.most_models - int(IMPROVING * self.most_models)

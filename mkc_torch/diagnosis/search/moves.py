@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects.per_recording import PerRecording, is_relative
+from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
@@ -105,6 +106,8 @@ def _free(bounds: tuple[Tensor, Tensor]) -> Tensor:
 def additions(fit: FittedModel, terms: Sequence[Term], settings: NoiseSettings) -> list[Addition]:
     """Return the effects that a model can add, by descending linear gain, each with its best shapes.
 
+    None for a model whose residual has no finite derivative, as next to an unstable trajectory.
+
     Args:
         fit: the model.
         terms: candidates with the shapes of their grids; effects that the model has are left out, with a common size or
@@ -116,7 +119,10 @@ def additions(fit: FittedModel, terms: Sequence[Term], settings: NoiseSettings) 
     terms = [term for term in terms if term.family not in known]
     if not terms:
         return []
-    gains, sizes = linear_gains(fit, terms, settings)
+    try:
+        gains, sizes = linear_gains(fit, terms, settings)
+    except NoFitError:
+        return []
     groups: dict[Key, list[int]] = {}
     for number, term in enumerate(terms):
         groups.setdefault(term.key, []).append(number)

@@ -1,6 +1,7 @@
 """The moves of the model search: additions by linear gain, wider grids, special cases and orders in series."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ import torch
 from mkc_torch import Recording
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.shapes import candidates_of
+from mkc_torch.diagnosis.model.shapes import candidate_terms, candidates_of
 from mkc_torch.diagnosis.search.moves import (
     STARTS,
     Addition,
@@ -23,9 +24,11 @@ from mkc_torch.diagnosis.search.moves import (
     special_cases,
     with_wide_grid,
 )
+from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 from mkc_torch.effects import CATALOGUE
-from mkc_torch.simulation import Dynamics, Parameter
+from mkc_torch.nonlinear import NoFitError
+from mkc_torch.simulation import Dynamics, Parameter, Stepper
 from tests.diagnosis.cart import DRAG, FRICTION, SAMPLES, STEP, Cart, cart_terms, first_term, fit_with, free_fit
 
 NOISE_SETTINGS = NoiseSettings()
@@ -260,3 +263,30 @@ def test_an_effect_in_series_with_a_lag_has_another_order():
     assert orders(drag, lag) == []  # at the rate, not in series with the input
     assert orders(dead_zone, delay) == []  # a delay commutes with a static effect
     assert orders(dead_zone) == []
+
+
+class Map(Stepper):
+    """A population that is chaotic for a growth near 4: its trajectory is finite, its derivatives overflow."""
+
+    states, inputs, time_step = ("population",), (), 1.0
+    parameters = {"growth": Parameter(2.0, lower=0.0, upper=4.0)}
+
+    def step(self, x, u, tau, p, dt):
+        return p.growth * x * (1.0 - x)
+
+
+def test_a_model_without_finite_derivatives_adds_no_effect():
+    generator = torch.Generator().manual_seed(0)
+    population = 0.5 + 1e-3 * torch.randn(3000, dtype=torch.float64, generator=generator)
+    time = torch.arange(3000, dtype=torch.float64)
+    prepared = Map().prepare(Recording({"time": time, "population": population}))
+    terms = candidate_terms(prepared, (), CATALOGUE)
+    stable = fitted(JointModel(prepared), prepared.start())
+    assert additions(stable, terms, NOISE_SETTINGS)
+    chaotic = torch.tensor([3.99, 0.3], dtype=torch.float64)
+    residual = stable.model.residual(chaotic).detach()
+    assert bool(residual.isfinite().all())
+    unstable = replace(stable, parameters=chaotic, residual=residual)
+    with pytest.raises(NoFitError, match="no finite derivative by growth"):
+        tangents_of(unstable.model, chaotic, NOISE_SETTINGS)
+    assert additions(unstable, terms, NOISE_SETTINGS) == []

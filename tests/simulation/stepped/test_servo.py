@@ -140,7 +140,7 @@ def searched(recording, away):
     theta = alone.parameters.clone()
     theta[0] = away * STIFFNESS
     start = replace(alone, parameters=theta, residual=alone.model.residual(theta).detach())
-    add_at_given_values(beam, start, terms)
+    beam.at_given = add_at_given_values(beam, start, terms)
     return beam
 
 
@@ -197,14 +197,30 @@ def test_a_late_command_takes_the_place_of_a_servo_that_is_far_too_soft():
     found, final = replaced(STIFFNESS / 15.0)
     assert found is not None
     assert found.values == {"stiffness": STIFFNESS}
-    assert float(found.model.fit.parameters[0]) == pytest.approx(STIFFNESS, rel=1e-9)
-    assert {term.effect.id for term in found.more} <= {"input_lag", "input_delay"}
-    assert found.more
-    assert found.more == found.model.fit.model.terms[1:]
+    fit = found.model.fit
+    assert float(fit.parameters[0]) == pytest.approx(STIFFNESS, rel=1e-9)
+    play, *more = fit.model.terms
+    assert play.effect.id == "backlash"
+    assert {term.effect.id for term in more} <= {"input_lag", "input_delay"}
     # a servo without inertia follows late by the ratio of its damping to its stiffness
-    lags = [sum(term.shape.values()) for term in found.more]
-    assert sum(lags) == pytest.approx(1.5 / (STIFFNESS / 15.0) - 1.5 / STIFFNESS, rel=0.3)
+    late = sum(sum(term.shape.values()) for term in more)
+    assert late == pytest.approx(1.5 / (STIFFNESS / 15.0) - 1.5 / STIFFNESS, rel=0.3)
     assert found.model.log_size < float(final.residual.square().mean().sqrt().log()) + 1.0
+
+
+def test_effects_that_suit_the_unlikely_number_alone_are_left_out():
+    beam = searched(followed(gap=GAP, zero=ZERO), 0.1)
+    found = beam.at_given
+    assert found is not None
+    assert {term.effect.id for term in found.model.fit.model.terms} >= {"backlash", "offset"}
+    assert float(found.model.fit.parameters[0]) == pytest.approx(STIFFNESS)
+    spring = next(term for term in beam.terms if term.effect.id == "cubic_stiffness")
+    soft = beam.models[()].fit
+    theta = torch.cat([soft.parameters, soft.parameters.new_zeros(1)])
+    theta[0] = 0.1 * STIFFNESS
+    model = soft.model.with_term(spring)
+    final = replace(soft, model=model, parameters=theta, residual=model.residual(theta).detach())
+    assert instead_of_numbers(beam, final, beam.terms) is found
 
 
 def test_nothing_takes_the_place_of_a_likely_number():
@@ -218,9 +234,9 @@ def test_effects_in_place_of_an_unlikely_number_are_named():
     found = diagnose(Servo(), recording, effects=effects, surrogates=19, seed=0)
     assert [finding.effect for finding in found.findings] == ["backlash"]
     (check,) = found.checks
-    assert "With `stiffness` at 60, the value given, the search finds input lag on the input command (lag" in (
-        check.sentence
-    )
+    begin = "With `stiffness` at 60, the value given, the search finds backlash on the input command (half gap 0.0"
+    assert begin in check.sentence
+    assert " and input lag on the input command (lag " in check.sentence
 
 
 def test_a_parameter_is_the_same_at_all_samples():
