@@ -22,7 +22,7 @@ from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.unlikely import is_unlikely
 
 _TRIED = 3
-"""Effects that are fitted at each step, of which the most likely is kept."""
+"""Effects that are fitted at each step, of which the most likely is kept; 1 in a search of few models."""
 
 _MOST = 3
 """Largest number of effects that are chosen in this way."""
@@ -72,7 +72,7 @@ def add_at_given_values(beam: Models, start: FittedModel, terms: Sequence[Term])
             model = beam.scored("choose effects at the given values", partial(_released, held, start))
             beam.keep([] if model is None else [replace(model, together=True)])
     model = beam.scored("hold unlikely numbers", lambda: last) if last is not None and last.model.terms else None
-    return None if model is None else AtGivenValues(values, model)
+    return None if model is None or model.score is None else AtGivenValues(values, model)
 
 
 def instead_of_numbers(beam: Models, final: FittedModel, terms: Sequence[Term]) -> AtGivenValues | None:
@@ -94,7 +94,7 @@ def instead_of_numbers(beam: Models, final: FittedModel, terms: Sequence[Term]) 
     while (more := _with_one_more(last, beam, terms)) is not None and len(more.model.terms) <= known + _MOST:
         last = more
     model = beam.scored("hold unlikely numbers", lambda: last) if last is not held else None
-    found = [] if model is None else [AtGivenValues(values, model)]
+    found = [] if model is None or model.score is None else [AtGivenValues(values, model)]
     if beam.at_given is not None and values.keys() <= beam.at_given.values.keys():
         found.append(beam.at_given)
     return max(found, key=lambda one: one.model.value, default=None)
@@ -136,8 +136,9 @@ def _held_at(fit: FittedModel, values: Mapping[str, float]) -> FittedModel | Non
 def _with_one_more(held: FittedModel, beam: Models, terms: Sequence[Term]) -> FittedModel | None:
     """Return the fit with the further effect that is worth most, of a number; None where none is worth its price."""
     named = [term for term in terms if not term.effect.is_curve]
+    tried = _TRIED if beam.most_models > 10 * _TRIED else 1
     found = one_form_each(additions(held, named, beam.settings.noise), beam.worth)
-    found = [one for one in sorted(found, key=beam.worth, reverse=True)[:_TRIED] if beam.worth(one) > 0.0]
+    found = [one for one in sorted(found, key=beam.worth, reverse=True)[:tried] if beam.worth(one) > 0.0]
     fits = run_parallel([partial(fitted_with, held, one) for one in found], held.model.prepared, beam.terms)
     best = max(fits, key=partial(_worth, beam=beam), default=held)
     return best if _worth(best, beam) > _worth(held, beam) else None
