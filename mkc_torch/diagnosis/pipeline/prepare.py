@@ -12,12 +12,13 @@ from mkc_torch._support.arguments import checked_number, checked_whole, format_v
 from mkc_torch._support.arrays import is_frame
 from mkc_torch.diagnosis.declared import checked_input_hold, checked_noise
 from mkc_torch.diagnosis.model.suspect import refuse_unknown
-from mkc_torch.diagnosis.pipeline.stretch import quick_stretch
+from mkc_torch.diagnosis.pipeline.stretch import in_stretches, quick_stretch
 from mkc_torch.diagnosis.settings import Settings, quick_settings
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.given_columns import EXPERIMENT
 from mkc_torch.recording.join_recordings import join_recordings, recording_names, refuse_no_recording
 from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.dynamics import Dynamics
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
 _FREE_SAMPLES = 6
@@ -95,6 +96,11 @@ def prepare(
     refuse_no_settings(options.settings)
     _refuse_no_progress(progress)
     progress("reading the recording")
+    of_steps = isinstance(simulation, Dynamics) and simulation.steps is not None
+    if isinstance(simulation, Dynamics) and "time" in recording and not (options.quick and of_steps):
+        shorter = in_stretches(several or (recording,))
+        several = shorter if several else ()
+        recording = joined(simulation, shorter if several else shorter[0])[0]
     prepared = simulation.prepare(recording)
     stretch = quick_stretch(prepared, recording) if options.quick else None
     prepared = prepared if stretch is None else simulation.prepare(stretch)
