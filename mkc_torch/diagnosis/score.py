@@ -33,6 +33,7 @@ from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid, key_of
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel
 from mkc_torch.simulation.dynamics.ports import ENTRIES, RATES
+from mkc_torch.simulation.dynamics.unlikely import price_of_values
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -207,8 +208,8 @@ def score(fit: FittedModel, basis: ScoreBasis, settings: Settings, near: Sequenc
         settings: thresholds.
         near: further noise models to try.
     """
-    flow = _flow(fit)
-    if flow is None or is_implausible(fit, basis):
+    flow, prepared = _flow(fit), fit.model.prepared.dynamics
+    if flow is None or prepared is None or is_implausible(fit, basis):
         return None
     flow = replace(flow, counts=basis.counts)
     models = [*_grid(fit, flow, basis).singles(), *near, *_own_noise(fit, basis)]
@@ -229,7 +230,7 @@ def score(fit: FittedModel, basis: ScoreBasis, settings: Settings, near: Sequenc
         basis.kappa * basis.choice * len(fit.model.terms),
         basis.kappa * settings.noise.disturbance_gain * disturbances,
         basis.kappa * forms,
-        -basis.kappa * fit.model.log_prior(fit.parameters),
+        basis.kappa * price_of_values(prepared, fit.parameters),
         noise,
         per_sample(flow, noise, basis.horizons, basis.span),
     )

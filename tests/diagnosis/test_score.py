@@ -124,6 +124,12 @@ def test_white_noise_gives_the_ordinary_likelihood() -> None:
     assert found.per_sample.sum() == pytest.approx(expected, rel=1e-6)
 
 
+class Bounded(Slide):
+    """The same body with a stiffness at a bound, which is no uncertainty."""
+
+    parameters = {"stiffness": Parameter(1.1, lower=1.09, upper=1.2), "damping": Parameter(0.05, lower=0.0)}
+
+
 class Uncertain(Slide):
     """The same body, whose stiffness was measured wrong."""
 
@@ -133,7 +139,7 @@ class Uncertain(Slide):
 def test_a_parameter_far_from_its_value_costs_half_the_square_of_its_distance() -> None:
     recording = recorded(0, friction=0.05)
     found = []
-    for simulation in (Slide(), Uncertain()):
+    for simulation in (Bounded(), Uncertain()):
         alone, friction = fits(simulation, recording)
         basis = replace(basis_of(alone, 10, {}, Settings()), kappa=2.0)
         away = (float(friction.parameters[0]) - 1.1) / 0.01

@@ -58,6 +58,16 @@ def is_unlikely(prepared: CheckedDynamics, known: Parameter, value: float) -> bo
     return distance(known, value, by_factor=_by_factor(prepared, known)) > _FAR
 
 
+def price_of_values(prepared: CheckedDynamics, values: Float[Tensor, " p"]) -> float:
+    """Half the sum of the squared distances of fitted values from the values given, in nats.
+
+    Bounds without an uncertainty cost nothing.
+    """
+    pairs = zip(prepared.known.values(), values.tolist(), strict=False)
+    away = (distance(known, value, by_factor=_by_factor(prepared, known)) for known, value in pairs)
+    return 0.5 * sum(each**2 for each in away)
+
+
 def _by_factor(prepared: CheckedDynamics, known: Parameter) -> bool:
     """Whether a value is compared by its factor: a positive number of a simulation that steps."""
     return prepared.system.steps is not None and known.lower == 0.0 < known.value
