@@ -24,6 +24,7 @@ from mkc_torch.diagnosis.model.process_noise import (
 from mkc_torch.diagnosis.model.shapes import described, shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time
+from mkc_torch.diagnosis.optional import optional
 from mkc_torch.diagnosis.pipeline.chains import (
     chain_of_line,
     chain_to,
@@ -124,8 +125,9 @@ def search_models(
         ]
         found = _first_confirmed(chains, search, beam, tested)
     final = found.found[-1].fit if found.found else _start(base)
-    progress("comparing with the values given")
-    return replace(found, instead=_instead(final, beam))
+    step = "comparing with the values given"
+    progress(step)
+    return replace(found, instead=optional(step, partial(_instead, final, beam), lambda: ""))
 
 
 def _first_confirmed(

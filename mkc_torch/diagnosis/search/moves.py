@@ -106,7 +106,7 @@ def _free(bounds: tuple[Tensor, Tensor]) -> Tensor:
 def additions(fit: FittedModel, terms: Sequence[Term], settings: NoiseSettings) -> list[Addition]:
     """Return the effects that a model can add, by descending linear gain, each with its best shapes.
 
-    None for a model whose residual has no finite derivative, as next to an unstable trajectory.
+    The list is empty for a model whose residual has no finite derivative, as next to an unstable trajectory.
 
     Args:
         fit: the model.
