@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -57,12 +58,12 @@ def apply(
     if simulation is not None and simulator_output is not None:
         raise typer.BadParameter("--simulation and --simulator-output exclude each other; give the diagnosed one.")
     with loading():
+        from mkc_torch.cli.applied_unit import corrected_in_its_unit
         from mkc_torch.cli.correction import (
             correct,
             correct_as_messages,
             read_correction,
             show_correction,
-            unit_of,
             with_sizes_of,
             write_correction,
         )
@@ -82,8 +83,10 @@ def apply(
             subject = output
             _refuse_input(output, recording, model, simulator_output)
             subject = recording
-            table, topic = read_again(recording, names, units, sensor, made_in=unit_of(known), of_field=own is None)
-            corrected = correct_as_messages(known, table) if ros else correct(known, table)
+            read = read_again(recording, names, units, sensor, recognise=own is None)
+            table, topic = read.recording, read.topic
+            correcting = partial(correct_as_messages if ros else correct, known)
+            corrected = corrected_in_its_unit(recording, read, known, correcting) if own is None else correcting(table)
             subject = output
             corrected = write_correction(recording, output, table, corrected, topic=topic, force=force)
     except Exception as error:

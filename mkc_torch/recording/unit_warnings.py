@@ -20,7 +20,7 @@ _AXES = "xyz"
 _FIELD = (10.0, 200.0)
 """Plausible range of a measured field, in µT; the Earth's field is 22 to 67, iron nearby and gains change it."""
 
-_EARTH = (20.0, 70.0)
+EARTH = (20.0, 70.0)
 """Range of the Earth's field, in µT."""
 
 _GUESSES = (
@@ -194,7 +194,7 @@ def _other_unit(size: float, before: str) -> str:
     raw = size / float(known.factor) if known is not None else math.nan
     for option in ("uT", "gauss", "mG", "nT", "tesla", "mT"):
         other = conversion("mag", option)
-        if other is not None and _EARTH[0] <= raw * float(other.factor) <= _EARTH[1]:
+        if other is not None and EARTH[0] <= raw * float(other.factor) <= EARTH[1]:
             return option
     return ""
 
