@@ -20,15 +20,16 @@ from mkc_torch.calibration.file import Matrix, Vector
 from mkc_torch.calibration.frozen_samples import without_frozen
 from mkc_torch.calibration.impossible_samples import without_impossible
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.calibration.offset_change import offset_change
 from mkc_torch.calibration.other_sensors import GRAVITY, accelerometer, rest_bias
-from mkc_torch.calibration.places import disturbed_places, numbered
+from mkc_torch.calibration.places import disturbed_places, numbered, places
 from mkc_torch.calibration.plain_values import ResidualSpread, matrix_of, spread_of, vector_of
 from mkc_torch.calibration.recorded_ellipsoid import recorded_ellipsoid
 from mkc_torch.calibration.result import Calibration
 from mkc_torch.calibration.runs import in_each_run, run_slices
 from mkc_torch.calibration.turning import thin_at_rest
 from mkc_torch.calibration.warning_order import NOT_COVERED, by_weight, is_fault
-from mkc_torch.density.tails import ChannelTails, time_series_tails
+from mkc_torch.density.tails import time_series_tails
 from mkc_torch.functional import mkc_weight
 from mkc_torch.linear import MKCRegression
 from mkc_torch.recording.recording import Recording, RecordingError
@@ -186,6 +187,9 @@ def _of_magnetometer(recording: Recording, field_strength: float | None, seed: i
 def _of_ellipsoid(fit: EllipsoidFit, usable: Recording, field_strength: float | None) -> Calibration:
     points = usable.magnetometer()
     radius = float(fit.radius_)
+    taken = in_each_run(points, run_slices(usable), thin_at_rest)
+    assert taken is not None
+    changed = offset_change(points[taken], places(usable)[taken], fit.center_, fit.calibration_matrix_, radius)
     strength = radius if field_strength is None else field_strength
     scale = strength / radius
     matrix_se = fit.calibration_matrix_se_ if field_strength is None else strength * fit.root_se_
@@ -229,15 +233,9 @@ def _of_ellipsoid(fit: EllipsoidFit, usable: Recording, field_strength: float | 
         ),
         notes=usable.notes,
         used=usable,
-        tails=_tails(usable, (length / radius).square() - 1.0),
+        tails=next(iter(time_series_tails(((length / radius).square() - 1.0)[taken].unsqueeze(-1))), None),
+        offset_change=changed,
     )
-
-
-def _tails(usable: Recording, residual: Tensor) -> ChannelTails | None:
-    """The tails of the residual of the fitted samples; None for an exact fit."""
-    taken = in_each_run(usable.magnetometer(), run_slices(usable), thin_at_rest)
-    assert taken is not None
-    return next(iter(time_series_tails(residual[taken].unsqueeze(-1))), None)
 
 
 def _density(fit: EllipsoidFit) -> tuple[float, float, float]:

@@ -99,7 +99,7 @@ def calibrate(
     A file with several magnetometers gets a calibration for each, in a subfolder of the sensor's name.
 
     The exit code is 0 if every recording was calibrated, 1 if one was not, and 3 if all were but a result is doubtful:
-    the correction reduces no scatter, or a third of the samples was rejected.
+    the correction reduces no scatter, a third of the samples was rejected, or the sensor's offset changed.
     """
     names = parsed_columns(columns)
     if field_strength is not None and not (math.isfinite(field_strength) and field_strength > 0):
