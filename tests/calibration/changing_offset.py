@@ -21,10 +21,10 @@ def _rotations(count, draw):
     """Rotation matrices of a sensor that is turned by hand, (N, 3, 3)."""
     rate = np.zeros((count, 3))
     memory = np.exp(-1.0 / RATE)
-    pushes = 1.5 * np.sqrt(1.0 - memory**2) * draw.normal(size=(count, 3))
+    noise = 1.5 * np.sqrt(1.0 - memory**2) * draw.normal(size=(count, 3))
     found, turned = np.empty((count, 3, 3)), np.eye(3)
     for row in range(count):
-        rate[row] = memory * rate[row - 1] + pushes[row]
+        rate[row] = memory * rate[row - 1] + noise[row]
         x, y, z = rate[row] / RATE
         skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         turned = turned @ np.linalg.solve(np.eye(3) - 0.5 * skew, np.eye(3) + 0.5 * skew)
@@ -32,7 +32,7 @@ def _rotations(count, draw):
     return found
 
 
-def _wander(count, draw, memory, size):
+def _first_order(count, draw, memory, size):
     values = size * np.sqrt(1.0 - memory**2) * draw.normal(size=(count, 3))
     for row in range(1, count):
         values[row] += memory * values[row - 1]
@@ -48,16 +48,16 @@ def changing(seed, count=4500, noise="white", scale=0.3, change=NONE):
     """A recording in µT; ``change`` is the size in µT, the kind, and the share before a step."""
     draw = np.random.default_rng(seed)
     turned, field = _rotations(count, draw), FIELD
-    if noise == "uneven field":  # by about 1 µT where a hand wanders by 0.1 m
+    if noise == "uneven field":  # by about 1 µT over the 0.1 m that a hand moves
         gradient = draw.normal(size=(3, 3))
-        field = FIELD + 0.5 * _wander(count, draw, 0.995, 1.0) @ (gradient + gradient.T)
+        field = FIELD + 0.5 * _first_order(count, draw, 0.995, 1.0) @ (gradient + gradient.T)
     points = np.einsum("nij,nj->ni", turned.transpose(0, 2, 1), np.broadcast_to(field, (count, 3)))
     distortion = 0.05 * draw.normal(size=(3, 3))
     points = points @ (np.eye(3) + 0.5 * (distortion + distortion.T)) + 20.0 * draw.normal(size=3)
     if noise == "heavy-tailed":
         points += scale * draw.standard_t(3, size=(count, 3))
     elif noise == "autocorrelated":
-        points += _wander(count, draw, 0.9, scale)
+        points += _first_order(count, draw, 0.9, scale)
     else:
         points += scale * draw.normal(size=(count, 3))
     if noise == "passing magnet":
