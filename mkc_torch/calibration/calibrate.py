@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number
+from mkc_torch._support.note import Note
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.calibration.aided.fallback import with_aid
 from mkc_torch.calibration.aided.place import Field
@@ -58,7 +59,24 @@ _LEAST = 1e-60
 FEW_SAMPLES = 50
 """Number of samples below which there is a warning."""
 
+MOST_SAMPLES = 100_000
+"""Most samples of a fit; a longer recording is thinned evenly, so that time and memory do not grow with it."""
+
 _AXES = ("mag_x", "mag_y", "mag_z")
+
+
+def thinned(recording: Recording) -> Recording:
+    """Every k-th sample of a long recording, with a note; a recording of at most ``MOST_SAMPLES`` is unchanged.
+
+    Example:
+        >>> len(thinned(Recording({"mag_x": torch.zeros(250_000)})))
+        83334
+    """
+    every = math.ceil(len(recording) / MOST_SAMPLES)
+    if every <= 1:
+        return recording
+    note = Note(f"Of the {len(recording):,} usable samples, every {every}th is used, evenly over the recording.")
+    return recording.rows(torch.arange(0, len(recording), every), note)
 
 
 def prepared(recording: Recording) -> Recording:
@@ -122,7 +140,8 @@ def calibrate(
 
     Samples that are not finite, impossible, frozen, or clipped are left out, and the others are sorted by time;
     ``warnings`` lists this. Without a time, rows are taken to be in the order of time. Standard errors allow for
-    autocorrelation within a run (``experiment``), not between runs. If the radius does not fit the unit, the unit is
+    autocorrelation within a run (``experiment``), not between runs. Of a recording of more than ``MOST_SAMPLES`` usable
+    samples, every second, third, … is used. If the radius does not fit the unit, the unit is
     "recorded units", and a warning states why.
 
     If the turns do not determine an ellipsoid, as for a vehicle that hardly tilts, an attitude ``q_*`` or a gyroscope
@@ -174,7 +193,7 @@ def _of_magnetometer(recording: Recording, field_strength: float | None, seed: i
     if earth is not None and field_strength is None:
         field_strength = earth.strength
     recording.stack(*_AXES)  # check before a column is added
-    usable = prepared(numbered(recording))
+    usable = thinned(prepared(numbered(recording)))
     try:
         fit = recorded_ellipsoid(usable, seed)
     except NotIdentifiableError as error:

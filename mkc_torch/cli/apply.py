@@ -84,11 +84,11 @@ def apply(
             _refuse_input(output, recording, model, simulator_output)
             subject = recording
             read = read_again(recording, names, units, sensor, recognise=own is None)
-            table, topic = read.recording, read.topic
+            table = read.recording
             correcting = partial(correct_as_messages if ros else correct, known)
             corrected = corrected_in_its_unit(recording, read, known, correcting) if own is None else correcting(table)
             subject = output
-            corrected = write_correction(recording, output, table, corrected, topic=topic, force=force)
+            corrected = write_correction(recording, output, read, corrected, force=force)
     except Exception as error:
         in_simulation = raised_in(simulation, error) if simulation and simulation not in SIMULATIONS else None
         if in_simulation is None and not isinstance(error, FAILURES):

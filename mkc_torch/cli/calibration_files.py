@@ -116,6 +116,8 @@ def calibrations_of(
     except FAILURES as error:
         yield str(path), error
         return
+    held = [topics]
+    del topics
     places = [folder / name for name in folder_names([str(name) for name in names])] if len(names) > 1 else [folder]
     for number, (name, place) in enumerate(zip(names, places, strict=True), start=1):
         subject, which = str(path), path.name
@@ -124,7 +126,9 @@ def calibrations_of(
         report_stage(f"calibrating {which}")
         drawing = partial(report_stage, f"drawing the report on {which}")
         try:
-            yield subject, _calibrate(path, place, request._replace(sensor=name), topics, drawing, force=force)
+            # the last sensor's calibration releases the tables, which are larger than its columns
+            tables = held.pop if number == len(names) else held.__getitem__
+            yield subject, _calibrate(path, place, request._replace(sensor=name), tables(0), drawing, force=force)
         except FAILURES as error:
             yield subject, error
     remove_if_empty(folder)
@@ -164,6 +168,8 @@ def _calibrate(
     else:
         recording, found = read_magnetometer(path, request.columns, request.units, request.sensor, topics)
         said = bool(found.with_stated_unit & {"mag_x", "mag_y", "mag_z"})
+        del found
+    del topics
     from mkc_torch.report import calibration_report, refusal_report
 
     report, result = folder / "report.html", folder / "calibration.json"

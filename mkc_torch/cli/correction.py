@@ -17,6 +17,7 @@ from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.exports.units import unit_ratio
 from mkc_torch.calibration.field_messages import magnetic_field_messages
 from mkc_torch.cli.console import out
+from mkc_torch.cli.recorded import ReadAgain
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.io import diagnosis_json as diagnosis_file
 from mkc_torch.diagnosis.io import model as diagnosed_model
@@ -40,17 +41,16 @@ OTHER_LENGTH = 1.15
 _GIVE = "give a calibration.json of `mkc calibrate` or a model.json of `mkc diagnose`"
 
 
-def write_correction(
-    recording: Path, output: Path, table: Recording, corrected: Corrected, *, topic: int = 0, force: bool
-) -> Corrected:
+def write_correction(recording: Path, output: Path, read: ReadAgain, corrected: Corrected, *, force: bool) -> Corrected:
     """Write the corrected columns, with the recording's other columns if the rows correspond, or with a note if not."""
+    table = read.recording
     if not _row_by_row(table, corrected):
         write_table(output, corrected.columns, labels=table.labels, overwrite=force)
         note = "the rows do not correspond to those of the recording, so its other columns are not kept."
         return replace(corrected, notes=(*corrected.notes, note))
     of_file = {name for name in _NOT_MEASURED if name in table}
     own = {name: values for name, values in corrected.columns.items() if name not in of_file}
-    write_with_columns(recording, output, own, topic=topic, overwrite=force)
+    write_with_columns(recording, output, own, topic=read.topic, overwrite=force, topics=read.topics)
     return corrected
 
 

@@ -89,9 +89,17 @@ def read_table(path: Path, columns: Mapping[str, str], units: Mapping[str, str])
 
 
 class ReadAgain(NamedTuple):
-    """A recording to correct, the index of its topic, and the columns whose unit the file or the user states."""
+    """A recording to correct.
+
+    Attributes:
+        recording: its columns.
+        topics: the tables of the file.
+        topic: index of the table that was read.
+        stated: columns whose unit the file or the user states.
+    """
 
     recording: Recording
+    topics: Sequence[Topic]
     topic: int
     stated: frozenset[str]
 
@@ -105,8 +113,11 @@ def read_again(
         path, columns, units, sensor: see :func:`read_magnetometer`.
         recognise: whether columns are recognised as those of a sensor; False for the user's own simulation.
     """
-    found = read_file(path, REQUIRED_COLUMNS, columns=columns, units=units, sensor=sensor, recognise=recognise)
-    return ReadAgain(_recording(path, found), found.topic, found.with_stated_unit)
+    topics = read_topics(path)
+    found = read_file(
+        path, REQUIRED_COLUMNS, columns=columns, units=units, sensor=sensor, recognise=recognise, topics=topics
+    )
+    return ReadAgain(_recording(path, found), topics, found.topic, found.with_stated_unit)
 
 
 def unit_option(quantity: str, unit: str) -> str:

@@ -145,7 +145,7 @@ def load_table(
                 continue
             else:
                 raise text_error(path, table, name, series, int(bad.arg_max()))
-        elif warning := missing_warning(table, name, series):
+        elif numbers.null_count() and (warning := missing_warning(table, name, series)):
             warnings.append(warning)
         values[name] = torch.tensor(
             converted(series, numbers, known.conversions.get(name)).fill_null(math.nan).to_numpy()
