@@ -10,6 +10,7 @@ import typer
 
 from mkc_torch.cli.console import FAILURES, complain, interrupts_reported, parsed_columns, progress
 from mkc_torch.cli.diagnosis_request import SIMULATIONS
+from mkc_torch.cli.early import refuse_no_text, refuse_unreadable
 from mkc_torch.cli.loading import loading
 from mkc_torch.cli.simulation_option import SIZES_OF_HELP
 from mkc_torch.cli.units_option import CONVERT_HELP, CONVERT_METAVAR, LABEL_HELP, SENSOR_HELP, parsed_units
@@ -57,6 +58,8 @@ def apply(
     names, units = parsed_columns(columns), parsed_units(convert or [], unit_label)
     if simulation is not None and simulator_output is not None:
         raise typer.BadParameter("--simulation and --simulator-output exclude each other; give the diagnosed one.")
+    refuse_no_text(model)
+    refuse_unreadable(recording, names, sensor, magnetometer=False)
     with loading():
         from mkc_torch.cli.applied_unit import corrected_in_its_unit
         from mkc_torch.cli.correction import (

@@ -17,6 +17,7 @@ from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.exports.units import unit_ratio
 from mkc_torch.calibration.field_messages import magnetic_field_messages
 from mkc_torch.cli.console import out
+from mkc_torch.cli.early import text_of
 from mkc_torch.cli.recorded import ReadAgain
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.io import diagnosis_json as diagnosis_file
@@ -152,7 +153,7 @@ def read_correction(path: Path, simulation: Simulation | None = None) -> Calibra
         ValueError: the file is neither, or a model whose simulation is not given.
         OSError: the file cannot be read.
     """
-    text = _text(path)
+    text = text_of(path)
     try:
         content = json.loads(text)
     except json.JSONDecodeError as error:
@@ -243,14 +244,3 @@ def correct_as_messages(known: Calibration | DiagnosedModel, recording: Recordin
 def unit_of(known: Calibration | DiagnosedModel) -> str:
     """Return the unit of the measurements behind a calibration or model, "" if there is none."""
     return known.unit if isinstance(known, Calibration) else str(known.state.get("unit", ""))
-
-
-def _text(path: Path) -> str:
-    if path.is_dir():
-        raise ValueError(f"{path}: this is a folder; give the calibration.json or model.json in it.")
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file.")
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: the file is not a text file; give a calibration.json or a model.json.") from None
