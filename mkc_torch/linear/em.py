@@ -17,6 +17,7 @@ from mkc_torch.linear._implicit.layer import GivenParameters, fit_layer, needs_d
 from mkc_torch.linear._implicit.stationary import FitState
 from mkc_torch.linear._inference import Inference
 from mkc_torch.linear._large import is_large, large_maximum, problem_in_basis
+from mkc_torch.linear._leverage import warn_of_followed_rows
 from mkc_torch.linear._many_rows import RowsMaximum
 from mkc_torch.linear._maximum import FixedParameters, LikelihoodMaximum, maximise
 from mkc_torch.linear._mkc import coefficient_covariance, kernel_weight, residual_dof
@@ -41,6 +42,10 @@ class MKCRegression(Inference):
     Joint Newton steps in all unknowns over all rows follow, in float64 whatever the dtype of the data: about eight
     passes, and no copy of X. They end where the next step is less than a millionth of a standard error. If they do not
     reach a maximum, for example where most values are fitted exactly, the fit is made as for fewer values.
+
+    Bad leverage points, rows far out in X with wrong targets, can have the highest likelihood: 4 of the 47 stars of
+    starsCYG do. A fit of a single problem of up to 20,000 rows that follows such rows, against an MM fit, warns and
+    names them.
 
     The fit is a differentiable layer: where X, Y, ``sample_weight`` or a given σ, d or bound require a gradient, or
     under a transform of ``torch.func``, ``coef_``, ``sigma_``, ``d_``, ``weights_`` and ``log_likelihood_`` carry the
@@ -136,6 +141,9 @@ class MKCRegression(Inference):
     def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> MKCRegression:
         """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. Weights multiply the log-density of each value.
 
+        Warns:
+            UserWarning: the fit follows bad leverage points; the message names their rows.
+
         Raises:
             ValueError: a parameter out of range or of the wrong shape, or bad input as in :meth:`LeastSquares.fit`.
             NotDifferentiableError: in the backward pass, for a fit that has no derivative.
@@ -155,6 +163,8 @@ class MKCRegression(Inference):
                 return self
             problem = linear_problem(X, Y, sample_weight)
             self._keep(problem, *self._maximise(problem, known))
+            if Y.dim() == 1 and sample_weight is None:
+                warn_of_followed_rows("MKCRegression", X, Y, self.coef_, self.weights_.squeeze(-1))
         return self
 
     def _maximise(self, problem: LinearProblem, known: FixedParameters) -> tuple[RobustStart, LikelihoodMaximum]:
