@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -21,9 +22,13 @@ from mkc_torch.linear._leverage import warn_of_followed_rows
 from mkc_torch.linear._many_rows import RowsMaximum
 from mkc_torch.linear._maximum import FixedParameters, LikelihoodMaximum, maximise
 from mkc_torch.linear._mkc import coefficient_covariance, kernel_weight, residual_dof
+from mkc_torch.linear._one_sided import one_sided_bias
 from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, checked_shapes, linear_problem
 from mkc_torch.linear._robust_start import RobustStart, Start, checked_start
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 
 class MKCRegression(Inference):
@@ -74,6 +79,9 @@ class MKCRegression(Inference):
         log_likelihood_: sum over samples and channels, (*,); compare only at equal ``bound_``.
         weights_: ``exp(-e² / (2 d² σ²))`` of each value.
         covariance_: covariance of the coefficients at the learned σ and d, (*, n, n).
+        one_sided_bias_: bound of the bias by one-sided outliers within three or four scales, which the intervals
+            contain, (*, n); 0 where the residuals are not skewed. Only of a fit to fewer than 20 000 values of a single
+            channel with covariance "sandwich" and without derivatives.
         history_: mean negative log-likelihood per sample, summed over channels, at every alternation or step.
         exact_fit_: whether more than half of the values lie on the fit to rounding, (*,).
         n_iter_, converged_: number of alternations or steps, and whether each problem converged; an exact fit has.
@@ -152,6 +160,7 @@ class MKCRegression(Inference):
         if needs_derivatives(X, Y, sample_weight, self.sigma, self.d, self.bound):
             return self._fit_as_layer(X, Y, sample_weight)
         self.__dict__.pop("differentiable_", None)
+        self.__dict__.pop("one_sided_bias_", None)
         with torch.no_grad():
             values = checked_shapes(X, Y, sample_weight)
             known = FixedParameters(self.sigma, self.d, self.bound, self.start)
@@ -239,3 +248,19 @@ class MKCRegression(Inference):
         self.converged_ = problem.restore(maximum.converged | begin.exact)
         self.dof_ = problem.restore(residual_dof(problem))
         self.covariance_ = coefficient_covariance(problem, maximum.beta, kappa, d, self.covariance, self.bandwidth)
+        if self.covariance == "sandwich":  # the skewness of a time series has another standard error
+            self.one_sided_bias_ = problem.restore(one_sided_bias(problem, maximum.beta))
+
+    def confidence_interval(self, level: float = 0.95) -> Float[Tensor, "*batch n 2"]:
+        """Confidence interval of each coefficient; see :meth:`Inference.confidence_interval`.
+
+        ``one_sided_bias_`` is added to the standard error in quadrature, because outliers of about three scales on one
+        side move the estimate without a trace in ``covariance_``.
+        """
+        narrow = super().confidence_interval(level)
+        error, bias = self.standard_error_, getattr(self, "one_sided_bias_", None)
+        if bias is None:
+            return narrow
+        ratio = torch.where(error > 0, torch.hypot(error, bias) / torch.where(error > 0, error, 1.0), 1.0)
+        half = torch.where(error > 0, ratio * 0.5 * (narrow[..., 1] - narrow[..., 0]), 0.0)
+        return torch.stack([self.coef_ - half, self.coef_ + half], -1)
