@@ -75,7 +75,7 @@ def thinned(recording: Recording) -> Recording:
     every = math.ceil(len(recording) / MOST_SAMPLES)
     if every <= 1:
         return recording
-    note = Note(f"Of the {len(recording):,} usable samples, every {every}th is used, evenly over the recording.")
+    note = Note(f"Of the {len(recording):,} usable samples, one in {every} is used, evenly over the recording.")
     return recording.rows(torch.arange(0, len(recording), every), note)
 
 
