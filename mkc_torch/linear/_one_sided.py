@@ -37,10 +37,10 @@ def one_sided_bias(problem: LinearProblem, beta: Tensor) -> Tensor:
     """Bound of the bias of each of the user's coefficients, (B, n); 0 for several channels, and for an exact fit."""
     residual = problem.residual(beta)
     scale = robust_scale(residual)
-    if problem.num_channels > 1:
-        return torch.zeros_like(problem.to_coef[..., 0])
-    rounding = 1e-6 * problem.Y.abs().amax(-2)
-    d = scale.clamp(min=torch.finfo(scale.dtype).tiny).maximum(rounding)
+    inexact = scale > 1e-6 * problem.Y.abs().amax(-2)
+    if problem.num_channels > 1 or not bool(inexact.any()):
+        return torch.zeros_like(beta)
+    d = torch.where(inexact, scale, 1.0)
     kappa, narrow = torch.full_like(d, _NARROW**-2), beta
     for _ in range(_STEPS):
         narrow = fixed_point_step(problem, problem.residual(narrow), kappa, d)
@@ -48,7 +48,7 @@ def one_sided_bias(problem: LinearProblem, beta: Tensor) -> Tensor:
     low, high = _SKEWED
     share = ((_skewness(problem, residual / d.unsqueeze(-2)) - low) / (high - low)).clamp(0.0, 1.0)
     bound = _MULTIPLE * share.sqrt().unsqueeze(-1) * distance
-    return torch.where((scale[..., 0] > rounding[..., 0]).unsqueeze(-1) & bound.isfinite(), bound, 0.0)
+    return torch.where(inexact & bound.isfinite(), bound, 0.0)
 
 
 def _skewness(problem: LinearProblem, z: Tensor) -> Tensor:

@@ -80,8 +80,8 @@ class MKCRegression(Inference):
         weights_: ``exp(-e² / (2 d² σ²))`` of each value.
         covariance_: covariance of the coefficients at the learned σ and d, (*, n, n).
         one_sided_bias_: bound of the bias by one-sided outliers within three or four scales, which the intervals
-            contain, (*, n); 0 where the residuals are not skewed. Only of a fit to fewer than 20 000 values of a single
-            channel with covariance "sandwich" and without derivatives.
+            contain, (*, n); 0 where the residuals are not skewed, for several channels, and from 20 000 values on. Not
+            of a fit with covariance "hac" or with derivatives.
         history_: mean negative log-likelihood per sample, summed over channels, at every alternation or step.
         exact_fit_: whether more than half of the values lie on the fit to rounding, (*,).
         n_iter_, converged_: number of alternations or steps, and whether each problem converged; an exact fit has.
@@ -230,6 +230,7 @@ class MKCRegression(Inference):
         self.weights_ = restored(weights)
         self.history_ = torch.stack([restored(h) for h in found.history])
         self.n_iter_ = len(found.history) - 1
+        self.one_sided_bias_ = torch.zeros_like(self.coef_)
         flag = torch.ones(values.batch, dtype=torch.bool, device=values.Y.device)
         self.converged_, self.exact_fit_ = flag, ~flag
 

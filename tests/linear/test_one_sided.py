@@ -33,3 +33,10 @@ def test_the_bound_has_the_unit_of_the_coefficients_and_is_0_for_an_exact_fit():
     exact = MKCRegression().fit(X[0], X[0] @ torch.tensor([1.0, 2.0], dtype=torch.float64))
     assert exact.one_sided_bias_.tolist() == [0.0, 0.0]
     assert exact.confidence_interval().isfinite().all()
+
+
+def test_several_channels_have_no_bound():
+    X, Y = draws("+3", 3, 60)
+    fit = MKCRegression().fit(X.unsqueeze(-2).expand(3, 60, 2, 2), torch.stack([Y, 2.0 * Y], -1))
+    assert fit.one_sided_bias_.shape == fit.coef_.shape
+    assert not bool(fit.one_sided_bias_.any())
