@@ -59,7 +59,7 @@ _LEAST = 1e-60
 FEW_SAMPLES = 50
 """Number of samples below which there is a warning."""
 
-MOST_SAMPLES = 100_000
+MOST_SAMPLES = 50_000
 """Most samples of a fit; a longer recording is thinned evenly, so that time and memory do not grow with it."""
 
 _AXES = ("mag_x", "mag_y", "mag_z")
@@ -70,7 +70,7 @@ def thinned(recording: Recording) -> Recording:
 
     Example:
         >>> len(thinned(Recording({"mag_x": torch.zeros(250_000)})))
-        83334
+        50000
     """
     every = math.ceil(len(recording) / MOST_SAMPLES)
     if every <= 1:

@@ -16,7 +16,6 @@ from mkc_torch.calibration.exports import EXPORTS, Destination, SensorCorrection
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.calibration.other_sensors import as_magnetometer
 from mkc_torch.cli.console import FAILURES, folder_names, folder_written, remove_if_empty
-from mkc_torch.cli.correction import read_correction
 from mkc_torch.cli.exported import exports_of, stale_exports
 from mkc_torch.cli.recorded import read_accelerometer, read_magnetometer, refuse_likely_size, sensor_names
 from mkc_torch.recording.formats import Topic, read_topics
@@ -83,6 +82,8 @@ def read_calibration(path: Path) -> Calibration:
         ValueError: the file is not a calibration.
         OSError: the file cannot be read.
     """
+    from mkc_torch.cli.correction import read_correction  # with the diagnosis, which takes a second to import
+
     known = read_correction(path)
     if not isinstance(known, Calibration):
         raise ValueError("this is the model of a diagnosis; give the calibration.json of `mkc calibrate`.")
