@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number
+from mkc_torch._support.note import Note
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.calibration.aided.fallback import with_aid
 from mkc_torch.calibration.aided.place import Field
@@ -20,15 +21,16 @@ from mkc_torch.calibration.file import Matrix, Vector
 from mkc_torch.calibration.frozen_samples import without_frozen
 from mkc_torch.calibration.impossible_samples import without_impossible
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.calibration.offset_change import offset_change
 from mkc_torch.calibration.other_sensors import GRAVITY, accelerometer, rest_bias
-from mkc_torch.calibration.places import disturbed_places, numbered
+from mkc_torch.calibration.places import disturbed_places, numbered, places
 from mkc_torch.calibration.plain_values import ResidualSpread, matrix_of, spread_of, vector_of
 from mkc_torch.calibration.recorded_ellipsoid import recorded_ellipsoid
 from mkc_torch.calibration.result import Calibration
 from mkc_torch.calibration.runs import in_each_run, run_slices
 from mkc_torch.calibration.turning import thin_at_rest
 from mkc_torch.calibration.warning_order import NOT_COVERED, by_weight, is_fault
-from mkc_torch.density.tails import ChannelTails, time_series_tails
+from mkc_torch.density.tails import time_series_tails
 from mkc_torch.functional import mkc_weight
 from mkc_torch.linear import MKCRegression
 from mkc_torch.recording.recording import Recording, RecordingError
@@ -57,7 +59,24 @@ _LEAST = 1e-60
 FEW_SAMPLES = 50
 """Number of samples below which there is a warning."""
 
+MOST_SAMPLES = 50_000
+"""Most samples of a fit; a longer recording is thinned evenly, so that time and memory do not grow with it."""
+
 _AXES = ("mag_x", "mag_y", "mag_z")
+
+
+def thinned(recording: Recording) -> Recording:
+    """Every k-th sample of a long recording, with a note; a recording of at most ``MOST_SAMPLES`` is unchanged.
+
+    Example:
+        >>> len(thinned(Recording({"mag_x": torch.zeros(250_000)})))
+        50000
+    """
+    every = math.ceil(len(recording) / MOST_SAMPLES)
+    if every <= 1:
+        return recording
+    note = Note(f"Of the {len(recording):,} usable samples, one in {every} is used, evenly over the recording.")
+    return recording.rows(torch.arange(0, len(recording), every), note)
 
 
 def prepared(recording: Recording) -> Recording:
@@ -121,7 +140,8 @@ def calibrate(
 
     Samples that are not finite, impossible, frozen, or clipped are left out, and the others are sorted by time;
     ``warnings`` lists this. Without a time, rows are taken to be in the order of time. Standard errors allow for
-    autocorrelation within a run (``experiment``), not between runs. If the radius does not fit the unit, the unit is
+    autocorrelation within a run (``experiment``), not between runs. Of a recording of more than ``MOST_SAMPLES`` usable
+    samples, every second, third, … is used. If the radius does not fit the unit, the unit is
     "recorded units", and a warning states why.
 
     If the turns do not determine an ellipsoid, as for a vehicle that hardly tilts, an attitude ``q_*`` or a gyroscope
@@ -173,7 +193,7 @@ def _of_magnetometer(recording: Recording, field_strength: float | None, seed: i
     if earth is not None and field_strength is None:
         field_strength = earth.strength
     recording.stack(*_AXES)  # check before a column is added
-    usable = prepared(numbered(recording))
+    usable = thinned(prepared(numbered(recording)))
     try:
         fit = recorded_ellipsoid(usable, seed)
     except NotIdentifiableError as error:
@@ -186,6 +206,9 @@ def _of_magnetometer(recording: Recording, field_strength: float | None, seed: i
 def _of_ellipsoid(fit: EllipsoidFit, usable: Recording, field_strength: float | None) -> Calibration:
     points = usable.magnetometer()
     radius = float(fit.radius_)
+    taken = in_each_run(points, run_slices(usable), thin_at_rest)
+    assert taken is not None
+    changed = offset_change(points[taken], places(usable)[taken], fit.center_, fit.calibration_matrix_, radius)
     strength = radius if field_strength is None else field_strength
     scale = strength / radius
     matrix_se = fit.calibration_matrix_se_ if field_strength is None else strength * fit.root_se_
@@ -229,15 +252,9 @@ def _of_ellipsoid(fit: EllipsoidFit, usable: Recording, field_strength: float | 
         ),
         notes=usable.notes,
         used=usable,
-        tails=_tails(usable, (length / radius).square() - 1.0),
+        tails=next(iter(time_series_tails(((length / radius).square() - 1.0)[taken].unsqueeze(-1))), None),
+        offset_change=changed,
     )
-
-
-def _tails(usable: Recording, residual: Tensor) -> ChannelTails | None:
-    """The tails of the residual of the fitted samples; None for an exact fit."""
-    taken = in_each_run(usable.magnetometer(), run_slices(usable), thin_at_rest)
-    assert taken is not None
-    return next(iter(time_series_tails(residual[taken].unsqueeze(-1))), None)
 
 
 def _density(fit: EllipsoidFit) -> tuple[float, float, float]:

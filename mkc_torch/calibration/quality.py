@@ -8,9 +8,10 @@ from mkc_torch.calibration.places import ROWS_A_SECOND
 from mkc_torch.calibration.result import Calibration
 from mkc_torch.recording.disturbance import RejectedInterval
 
-Doubt = Literal["not_better", "much_rejected"]
+Doubt = Literal["not_better", "much_rejected", "offset_changed"]
 """``not_better``: the corrected field's length scatters no less than the measured length.
 ``much_rejected``: a third or more of the samples were rejected.
+``offset_changed``: the sensor's offset changed during the recording.
 """
 
 MUCH_REJECTED = 1.0 / 3.0
@@ -34,6 +35,8 @@ def doubts(calibration: Calibration) -> tuple[Doubt, ...]:
         found.append("not_better")
     if calibration.rejected_share >= MUCH_REJECTED:
         found.append("much_rejected")
+    if calibration.offset_change is not None:
+        found.append("offset_changed")
     return tuple(found)
 
 

@@ -101,7 +101,8 @@ def _refuse_other(fit: EllipsoidFit, along: EllipsoidFit, went: Tensor) -> None:
         "Not identifiable: single samples determine the ellipsoid. Without samples that differ from their neighbours, "
         f"its centre or a semi-axis changes by {100.0 * float(apart.max()):.0f} % of the radius."
         f"{f' Directions not covered: {missing}.' if missing else ''} Record again away from what disturbs the sensor, "
-        "and turn it through all directions.",
+        "and turn it through all directions. If the sensor's offset changed during the recording, `mkc diagnose` "
+        "reports when.",
         found,
         along.calibrate(went)[along.weights_ >= 0.5],
     )

@@ -22,6 +22,7 @@ from mkc_torch.calibration.file import (
     finite_or_none,
     refuse_constant,
 )
+from mkc_torch.calibration.offset_change import OffsetChange
 from mkc_torch.calibration.plain_values import ResidualSpread
 from mkc_torch.calibration.plot import CalibrationPlot
 from mkc_torch.density.tails import ChannelTails
@@ -78,6 +79,8 @@ class Calibration:
         name: name of the sensor; the recording's name unless another name was given.
         tails: tails of :meth:`algebraic_residual` compared with a Gaussian's, and the expected share of errors beyond
             3 d; None for an exact fit, and for a file without them.
+        offset_change: a change of the offset during the recording, which makes the calibration doubtful; None if none
+            was found.
         used: the samples of the fit, for plots; None if the calibration was read from a file.
     """
 
@@ -111,6 +114,7 @@ class Calibration:
     tails: ChannelTails | None = None
     used: Recording | None = field(default=None, repr=False, compare=False)
     notes: tuple[str, ...] = ()
+    offset_change: OffsetChange | None = None
 
     @property
     def plot(self) -> CalibrationPlot:
@@ -248,6 +252,8 @@ def calibration_to_json(calibration: Calibration) -> str:
     }
     if c.sensor != "mag":
         content["sensor"] = c.sensor
+    if c.offset_change is not None:
+        content["offset_change"] = c.offset_change._asdict()
     if c.rest_bias is not None:
         content["gyroscope"] = {
             "bias": {"value": c.rest_bias.value, "standard_error": finite_or_none(c.rest_bias.standard_error)},
@@ -311,6 +317,7 @@ def calibration_from_json(text: str) -> Calibration:
         disturbed_unit=c.text("rejected", "interval_unit") if c.has("rejected", "interval_unit") else "s",
         aid=aid_from_json(c),
         sensor=c.text("sensor") if c.has("sensor") else "mag",
+        offset_change=_change_from(c) if c.has("offset_change") else None,
         rest_bias=RestBias(
             c.vector("gyroscope", "bias", "value"),
             c.vector("gyroscope", "bias", "standard_error", unknown=True),
@@ -322,3 +329,9 @@ def calibration_from_json(text: str) -> Calibration:
         if c.has("noise", "likelihood_ratio")
         else None,
     )
+
+
+def _change_from(c: CheckedValues) -> OffsetChange:
+    at = None if c.content["offset_change"].get("at") is None else c.number("offset_change", "at")
+    size, p_value = c.positive("offset_change", "size"), c.number("offset_change", "p_value")
+    return OffsetChange(c.text("offset_change", "kind"), size, at, p_value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,7 @@ import typer
 
 from mkc_torch.cli.console import FAILURES, complain, interrupts_reported, parsed_columns, progress
 from mkc_torch.cli.diagnosis_request import SIMULATIONS
+from mkc_torch.cli.early import refuse_no_text, refuse_unreadable
 from mkc_torch.cli.loading import loading
 from mkc_torch.cli.simulation_option import SIZES_OF_HELP
 from mkc_torch.cli.units_option import CONVERT_HELP, CONVERT_METAVAR, LABEL_HELP, SENSOR_HELP, parsed_units
@@ -56,13 +58,15 @@ def apply(
     names, units = parsed_columns(columns), parsed_units(convert or [], unit_label)
     if simulation is not None and simulator_output is not None:
         raise typer.BadParameter("--simulation and --simulator-output exclude each other; give the diagnosed one.")
+    refuse_no_text(model)
+    refuse_unreadable(recording, names, sensor, magnetometer=False)
     with loading():
+        from mkc_torch.cli.applied_unit import corrected_in_its_unit
         from mkc_torch.cli.correction import (
             correct,
             correct_as_messages,
             read_correction,
             show_correction,
-            unit_of,
             with_sizes_of,
             write_correction,
         )
@@ -82,10 +86,12 @@ def apply(
             subject = output
             _refuse_input(output, recording, model, simulator_output)
             subject = recording
-            table, topic = read_again(recording, names, units, sensor, made_in=unit_of(known), of_field=own is None)
-            corrected = correct_as_messages(known, table) if ros else correct(known, table)
+            read = read_again(recording, names, units, sensor, recognise=own is None)
+            table = read.recording
+            correcting = partial(correct_as_messages if ros else correct, known)
+            corrected = corrected_in_its_unit(recording, read, known, correcting) if own is None else correcting(table)
             subject = output
-            corrected = write_correction(recording, output, table, corrected, topic=topic, force=force)
+            corrected = write_correction(recording, output, read, corrected, force=force)
     except Exception as error:
         in_simulation = raised_in(simulation, error) if simulation and simulation not in SIMULATIONS else None
         if in_simulation is None and not isinstance(error, FAILURES):

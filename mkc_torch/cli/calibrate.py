@@ -21,6 +21,7 @@ from mkc_torch.cli.console import (
     progress,
     refuse_same_names,
 )
+from mkc_torch.cli.early import refuse_unreadable
 from mkc_torch.cli.export_options import DEVICE_ID, INSTANCE, checked_exports
 from mkc_torch.cli.loading import loading
 from mkc_torch.cli.units_option import (
@@ -99,7 +100,7 @@ def calibrate(
     A file with several magnetometers gets a calibration for each, in a subfolder of the sensor's name.
 
     The exit code is 0 if every recording was calibrated, 1 if one was not, and 3 if all were but a result is doubtful:
-    the correction reduces no scatter, or a third of the samples was rejected.
+    the correction reduces no scatter, a third of the samples was rejected, or the sensor's offset changed.
     """
     names = parsed_columns(columns)
     if field_strength is not None and not (math.isfinite(field_strength) and field_strength > 0):
@@ -117,6 +118,8 @@ def calibrate(
     units = parsed_units(conversions, unit_label)
     refuse_same_names(recordings)
     read_with = reading_options(names, conversions, unit_label)
+    if len(recordings) == 1:  # of several, the others are calibrated all the same
+        refuse_unreadable(recordings[0], names, sensor, magnetometer=quantity is Quantity.mag)
     with loading():
         from mkc_torch._parallel.processes import keep_memory
         from mkc_torch.calibration.aided.place import earth_field, parsed_date, parsed_place

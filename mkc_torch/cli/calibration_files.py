@@ -16,7 +16,6 @@ from mkc_torch.calibration.exports import EXPORTS, Destination, SensorCorrection
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.calibration.other_sensors import as_magnetometer
 from mkc_torch.cli.console import FAILURES, folder_names, folder_written, remove_if_empty
-from mkc_torch.cli.correction import read_correction
 from mkc_torch.cli.exported import exports_of, stale_exports
 from mkc_torch.cli.recorded import read_accelerometer, read_magnetometer, refuse_likely_size, sensor_names
 from mkc_torch.recording.formats import Topic, read_topics
@@ -83,6 +82,8 @@ def read_calibration(path: Path) -> Calibration:
         ValueError: the file is not a calibration.
         OSError: the file cannot be read.
     """
+    from mkc_torch.cli.correction import read_correction  # with the diagnosis, which takes a second to import
+
     known = read_correction(path)
     if not isinstance(known, Calibration):
         raise ValueError("this is the model of a diagnosis; give the calibration.json of `mkc calibrate`.")
@@ -116,6 +117,8 @@ def calibrations_of(
     except FAILURES as error:
         yield str(path), error
         return
+    held = [topics]
+    del topics
     places = [folder / name for name in folder_names([str(name) for name in names])] if len(names) > 1 else [folder]
     for number, (name, place) in enumerate(zip(names, places, strict=True), start=1):
         subject, which = str(path), path.name
@@ -124,7 +127,9 @@ def calibrations_of(
         report_stage(f"calibrating {which}")
         drawing = partial(report_stage, f"drawing the report on {which}")
         try:
-            yield subject, _calibrate(path, place, request._replace(sensor=name), topics, drawing, force=force)
+            # the last sensor's calibration releases the tables, which are larger than its columns
+            tables = held.pop if number == len(names) else held.__getitem__
+            yield subject, _calibrate(path, place, request._replace(sensor=name), tables(0), drawing, force=force)
         except FAILURES as error:
             yield subject, error
     remove_if_empty(folder)
@@ -164,6 +169,8 @@ def _calibrate(
     else:
         recording, found = read_magnetometer(path, request.columns, request.units, request.sensor, topics)
         said = bool(found.with_stated_unit & {"mag_x", "mag_y", "mag_z"})
+        del found
+    del topics
     from mkc_torch.report import calibration_report, refusal_report
 
     report, result = folder / "report.html", folder / "calibration.json"

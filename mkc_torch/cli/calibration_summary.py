@@ -13,6 +13,7 @@ from rich.text import Text
 
 from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.differences import Differences
+from mkc_torch.calibration.quality import doubts
 from mkc_torch.cli.remarks import NOTE, note_rows, warning_rows
 from mkc_torch.report.words import numbers as w
 from mkc_torch.report.words.comparison import difference_rows, difference_sentences
@@ -59,10 +60,16 @@ def show(
     if compared is not None:
         _show_differences(console, compared)
     if files and source is not None:
-        words = ("mkc", "apply", str(files[0]), str(source), *read_with, "--output", "corrected.csv")
-        command = shlex.join(words)
+        command = shlex.join(_next_command(c, files[0], source, read_with))
         console.print(Text(f"{'to do':<{_LABEL + 3}}{command}"), soft_wrap=True)
     _print_files(console, files)
+
+
+def _next_command(c: Calibration, file: Path, source: Path, read_with: Sequence[str]) -> tuple[str, ...]:
+    """Return the proposed command: a diagnosis of a changed offset, else the correction of the recording."""
+    if "offset_changed" in doubts(c) and c.sensor == "mag":
+        return "mkc", "diagnose", str(source), "--simulation", "magnetometer", *read_with, "--output", "diagnosed"
+    return "mkc", "apply", str(file), str(source), *read_with, "--output", "corrected.csv"
 
 
 def show_sensors(console: Console, recording: str, results: Sequence[SensorResult]) -> None:

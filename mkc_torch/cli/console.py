@@ -100,9 +100,9 @@ def sentence_of(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         where = f"{error.filename} " if error.filename else ""
         return f"{where}cannot be written or read: {error.strerror.lower()}; choose another place."
-    from mkc_torch.simulation.load import SimulationFileError
+    loaded = sys.modules.get("mkc_torch.simulation.load")  # its import takes seconds
 
-    if isinstance(error, SimulationFileError):
+    if loaded is not None and isinstance(error, loaded.SimulationFileError):
         return str(error)
     return " ".join(str(error).split())
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,8 @@ from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.exports.units import unit_ratio
 from mkc_torch.calibration.field_messages import magnetic_field_messages
 from mkc_torch.cli.console import out
+from mkc_torch.cli.early import text_of
+from mkc_torch.cli.recorded import ReadAgain
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.io import diagnosis_json as diagnosis_file
 from mkc_torch.diagnosis.io import model as diagnosed_model
@@ -33,23 +36,22 @@ if TYPE_CHECKING:
 
 _NOT_MEASURED = ("time", "experiment")
 
-_OTHER_LENGTH = 1.15
+OTHER_LENGTH = 1.15
 """Ratio of field lengths, up or down, beyond which a recording is suspected to be of another unit or place."""
 
 _GIVE = "give a calibration.json of `mkc calibrate` or a model.json of `mkc diagnose`"
 
 
-def write_correction(
-    recording: Path, output: Path, table: Recording, corrected: Corrected, *, topic: int = 0, force: bool
-) -> Corrected:
+def write_correction(recording: Path, output: Path, read: ReadAgain, corrected: Corrected, *, force: bool) -> Corrected:
     """Write the corrected columns, with the recording's other columns if the rows correspond, or with a note if not."""
+    table = read.recording
     if not _row_by_row(table, corrected):
         write_table(output, corrected.columns, labels=table.labels, overwrite=force)
         note = "the rows do not correspond to those of the recording, so its other columns are not kept."
         return replace(corrected, notes=(*corrected.notes, note))
     of_file = {name for name in _NOT_MEASURED if name in table}
     own = {name: values for name, values in corrected.columns.items() if name not in of_file}
-    write_with_columns(recording, output, own, topic=topic, overwrite=force)
+    write_with_columns(recording, output, own, topic=read.topic, overwrite=force, topics=read.topics)
     return corrected
 
 
@@ -65,10 +67,10 @@ def show_correction(table: Recording, corrected: Corrected, output: Path) -> Non
     """Print warnings, notes and a summary of the written file."""
     console = out()
     columns = {name: values for name, values in corrected.columns.items() if name not in _NOT_MEASURED}
-    field = [name for name in columns if name.startswith(("field_", "magnetic_field."))] or list(columns)
-    values = torch.stack([columns[name] for name in field], -1)
+    field = corrected.field()
+    is_field = field is not None
+    values = torch.stack(list(columns.values()), -1) if field is None else field
     missing = int((~values.isfinite().all(-1)).sum())
-    is_field = field in [[f"{name}{axis}" for axis in "xyz"] for name in ("field_", "magnetic_field.")]
     for warning in table.warnings:
         console.print(f"warning: {warning}", soft_wrap=True)
     for note in (*table.notes, *corrected.notes):
@@ -84,7 +86,7 @@ def show_correction(table: Recording, corrected: Corrected, output: Path) -> Non
         summary = ", ".join([f"{len(values):,} rows of {', '.join(columns)} simulated with the findings", *sizes])
     elif missing < len(values):
         length = float(torch.linalg.vector_norm(values, dim=-1).nanmedian())
-        if sentence := _other_length(length, corrected):
+        if sentence := _other_length(corrected):
             console.print(f"warning: {sentence}", soft_wrap=True)
         summary = f"{len(values):,} rows corrected, median length {length:.5g} {corrected.unit}".rstrip()
     else:
@@ -92,14 +94,14 @@ def show_correction(table: Recording, corrected: Corrected, output: Path) -> Non
     console.print(f"{summary}: {output}", soft_wrap=True)
 
 
-def _other_length(length: float, corrected: Corrected) -> str | None:
+def _other_length(corrected: Corrected) -> str | None:
     """Return a warning if the field's length is far from that of the calibrated recording, else None."""
-    expected, unit = corrected.length, corrected.unit
-    if expected is None or not length > 0 or abs(math.log(length / expected)) < math.log(_OTHER_LENGTH):
+    ratio, expected = corrected.length_ratio(), corrected.length
+    if ratio is None or expected is None or abs(math.log(ratio)) < math.log(OTHER_LENGTH):
         return None
     return (
-        f"the corrected field's median length is {size(length)}, {size(length / expected)} times the "
-        f"{size(expected)} {unit} of the calibrated recording; check the unit, the sensor and the place."
+        f"the corrected field's median length is {size(ratio * expected)}, {size(ratio)} times the "
+        f"{size(expected)} {corrected.unit} of the calibrated recording; check the unit, the sensor and the place."
     ).replace("  ", " ")
 
 
@@ -120,8 +122,24 @@ class Corrected:
     unit: str
     length: float | None
     notes: tuple[str, ...]
-    residuals: Mapping[str, float] = field(default_factory=dict)
-    units: Mapping[str, str] = field(default_factory=dict)
+    residuals: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    units: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    def field(self) -> Tensor | None:
+        """The corrected field, (N, 3); None for the outputs of the user's own simulation."""
+        for prefix in ("field_", "magnetic_field."):
+            names = [f"{prefix}{axis}" for axis in "xyz"]
+            if set(names) <= set(self.columns):
+                return torch.stack([self.columns[name] for name in names], -1)
+        return None
+
+    def length_ratio(self) -> float | None:
+        """Median length of the corrected field over that of the calibrated recording; None if either is unknown."""
+        vectors = self.field()
+        if vectors is None or self.length is None:
+            return None
+        median = float(torch.linalg.vector_norm(vectors, dim=-1).nanmedian())
+        return median / self.length if median > 0.0 else None
 
 
 def read_correction(path: Path, simulation: Simulation | None = None) -> Calibration | DiagnosedModel:
@@ -135,7 +153,7 @@ def read_correction(path: Path, simulation: Simulation | None = None) -> Calibra
         ValueError: the file is neither, or a model whose simulation is not given.
         OSError: the file cannot be read.
     """
-    text = _text(path)
+    text = text_of(path)
     try:
         content = json.loads(text)
     except json.JSONDecodeError as error:
@@ -226,14 +244,3 @@ def correct_as_messages(known: Calibration | DiagnosedModel, recording: Recordin
 def unit_of(known: Calibration | DiagnosedModel) -> str:
     """Return the unit of the measurements behind a calibration or model, "" if there is none."""
     return known.unit if isinstance(known, Calibration) else str(known.state.get("unit", ""))
-
-
-def _text(path: Path) -> str:
-    if path.is_dir():
-        raise ValueError(f"{path}: this is a folder; give the calibration.json or model.json in it.")
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file.")
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: the file is not a text file; give a calibration.json or a model.json.") from None

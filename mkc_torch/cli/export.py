@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mkc_torch.cli.console import FAILURES, complain, out
+from mkc_torch.cli.early import refuse_no_text
 from mkc_torch.cli.export_options import DEVICE_ID, INSTANCE, checked_exports
 from mkc_torch.cli.loading import loading
 
@@ -36,6 +37,7 @@ def export(
     if name is not None and not name.strip():
         raise typer.BadParameter("--name is empty; name the sensor, such as mast.")
     checked_exports("--to", [to], instance, device_id)
+    refuse_no_text(model)
     with loading():
         from mkc_torch._support.files import write_atomically
         from mkc_torch.calibration.exports import EXPORTS, Destination

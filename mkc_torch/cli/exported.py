@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.exports import EXPORTS, Destination, ExportError, SensorCorrection
-from mkc_torch.diagnosis import DiagnosedModel
-from mkc_torch.diagnosis.io.sensor_correction import sensor_correction
+
+if TYPE_CHECKING:
+    from mkc_torch.diagnosis import DiagnosedModel
 
 
 def correction_of(known: Calibration | DiagnosedModel, path: Path, name: str | None) -> SensorCorrection:
@@ -19,7 +21,9 @@ def correction_of(known: Calibration | DiagnosedModel, path: Path, name: str | N
         ExportError: the model is not one of a magnetometer.
     """
     given = None if name is None else name.strip()
-    if isinstance(known, DiagnosedModel):
+    if not isinstance(known, Calibration):
+        from mkc_torch.diagnosis.io.sensor_correction import sensor_correction  # the import takes a second
+
         return sensor_correction(known, given or path.resolve().parent.name)
     correction = SensorCorrection.of(known)
     return replace(correction, name=given or correction.name)

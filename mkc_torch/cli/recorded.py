@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from mkc_torch.recording.choice import sensors_in, which_columns
 from mkc_torch.recording.formats import read_topics
@@ -12,8 +13,8 @@ from mkc_torch.recording.load import REQUIRED_COLUMNS, LoadedTable, read_file
 from mkc_torch.recording.recognise import recognised
 from mkc_torch.recording.recording import Recording
 from mkc_torch.recording.row_sensors import with_row_sensors
-from mkc_torch.recording.unit_warnings import RECORDED, field_size, likely_unit
-from mkc_torch.recording.unit_words import conversion
+from mkc_torch.recording.unit_warnings import field_size, likely_unit
+from mkc_torch.recording.unit_words import conversion, factors
 
 _AXES = ("mag_x", "mag_y", "mag_z")
 
@@ -87,38 +88,48 @@ def read_table(path: Path, columns: Mapping[str, str], units: Mapping[str, str])
     return _recording(path, read_file(path, REQUIRED_COLUMNS, columns=columns, units=units, recognise=False))
 
 
+class ReadAgain(NamedTuple):
+    """A recording to correct.
+
+    Attributes:
+        recording: its columns.
+        topics: the tables of the file.
+        topic: index of the table that was read.
+        stated: columns whose unit the file or the user states.
+    """
+
+    recording: Recording
+    topics: Sequence[Topic]
+    topic: int
+    stated: frozenset[str]
+
+
 def read_again(
-    path: Path,
-    columns: Mapping[str, str],
-    units: Mapping[str, str],
-    sensor: str | None,
-    *,
-    made_in: str,
-    of_field: bool,
-) -> tuple[Recording, int]:
-    """Read a recording to correct. Returns it with the number of its topic.
+    path: Path, columns: Mapping[str, str], units: Mapping[str, str], sensor: str | None, *, recognise: bool
+) -> ReadAgain:
+    """Read a recording to correct.
 
     Args:
         path, columns, units, sensor: see :func:`read_magnetometer`.
-        made_in: unit of the calibrated recording; "" if unknown.
-        of_field: whether the recording is of a magnetometer, and not for the user's own simulation.
-
-    Raises:
-        RecordingError: the recording is given in another unit.
+        recognise: whether columns are recognised as those of a sensor; False for the user's own simulation.
     """
-    found = read_file(path, REQUIRED_COLUMNS, columns=columns, units=units, sensor=sensor, recognise=of_field)
-    recording = _recording(path, found)
-    said = [name for name in _AXES if name in found.with_stated_unit]
-    if of_field and said and made_in not in ("", RECORDED) and recording.units[said[0]] != made_in:
-        raise RecordingError(
-            f"{path}: the magnetometer is in {recording.units[said[0]]}, but the calibrated recording was in "
-            f"{made_in}; convert the columns, or give their unit with `{_unit_option(made_in)}`."
-        )
-    return recording, found.topic
+    topics = read_topics(path)
+    found = read_file(
+        path, REQUIRED_COLUMNS, columns=columns, units=units, sensor=sensor, recognise=recognise, topics=topics
+    )
+    return ReadAgain(_recording(path, found), topics, found.topic, found.with_stated_unit)
 
 
-def _unit_option(unit: str) -> str:
-    return f"--unit-label {unit}" if conversion("mag", unit) is None else f"--convert mag={unit}"
+def unit_option(quantity: str, unit: str) -> str:
+    """Return the option that gives a quantity this unit, as calibrated.
+
+    Example:
+        >>> unit_option("mag", "counts"), unit_option("accel", "m/s²")
+        ('--unit-label counts', '--convert accel=m/s2')
+    """
+    known = conversion(quantity, unit)
+    typed = next((name for name, factor in factors(quantity).items() if known and factor == known.factor), unit)
+    return f"--unit-label {unit}" if known is None else f"--convert {quantity}={typed}"
 
 
 def refuse_likely_size(path: Path, size: float) -> None:

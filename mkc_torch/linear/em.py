@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -17,12 +18,17 @@ from mkc_torch.linear._implicit.layer import GivenParameters, fit_layer, needs_d
 from mkc_torch.linear._implicit.stationary import FitState
 from mkc_torch.linear._inference import Inference
 from mkc_torch.linear._large import is_large, large_maximum, problem_in_basis
+from mkc_torch.linear._leverage import warn_of_followed_rows
 from mkc_torch.linear._many_rows import RowsMaximum
 from mkc_torch.linear._maximum import FixedParameters, LikelihoodMaximum, maximise
 from mkc_torch.linear._mkc import coefficient_covariance, kernel_weight, residual_dof
+from mkc_torch.linear._one_sided import one_sided_bias
 from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, checked_shapes, linear_problem
 from mkc_torch.linear._robust_start import RobustStart, Start, checked_start
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 
 class MKCRegression(Inference):
@@ -41,6 +47,10 @@ class MKCRegression(Inference):
     Joint Newton steps in all unknowns over all rows follow, in float64 whatever the dtype of the data: about eight
     passes, and no copy of X. They end where the next step is less than a millionth of a standard error. If they do not
     reach a maximum, for example where most values are fitted exactly, the fit is made as for fewer values.
+
+    Bad leverage points, rows far out in X with wrong targets, can have the highest likelihood: 4 of the 47 stars of
+    starsCYG do. A fit of a single problem of up to 20,000 rows that follows such rows, against an MM fit, warns and
+    names them.
 
     The fit is a differentiable layer: where X, Y, ``sample_weight`` or a given σ, d or bound require a gradient, or
     under a transform of ``torch.func``, ``coef_``, ``sigma_``, ``d_``, ``weights_`` and ``log_likelihood_`` carry the
@@ -69,6 +79,9 @@ class MKCRegression(Inference):
         log_likelihood_: sum over samples and channels, (*,); compare only at equal ``bound_``.
         weights_: ``exp(-e² / (2 d² σ²))`` of each value.
         covariance_: covariance of the coefficients at the learned σ and d, (*, n, n).
+        one_sided_bias_: bound of the bias by one-sided outliers within three or four scales, which the intervals
+            contain, (*, n); 0 where the residuals are not skewed, for several channels, and from 20 000 values on. Not
+            of a fit with covariance "hac" or with derivatives.
         history_: mean negative log-likelihood per sample, summed over channels, at every alternation or step.
         exact_fit_: whether more than half of the values lie on the fit to rounding, (*,).
         n_iter_, converged_: number of alternations or steps, and whether each problem converged; an exact fit has.
@@ -136,6 +149,9 @@ class MKCRegression(Inference):
     def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> MKCRegression:
         """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. Weights multiply the log-density of each value.
 
+        Warns:
+            UserWarning: the fit follows bad leverage points; the message names their rows.
+
         Raises:
             ValueError: a parameter out of range or of the wrong shape, or bad input as in :meth:`LeastSquares.fit`.
             NotDifferentiableError: in the backward pass, for a fit that has no derivative.
@@ -144,6 +160,7 @@ class MKCRegression(Inference):
         if needs_derivatives(X, Y, sample_weight, self.sigma, self.d, self.bound):
             return self._fit_as_layer(X, Y, sample_weight)
         self.__dict__.pop("differentiable_", None)
+        self.__dict__.pop("one_sided_bias_", None)
         with torch.no_grad():
             values = checked_shapes(X, Y, sample_weight)
             known = FixedParameters(self.sigma, self.d, self.bound, self.start)
@@ -155,6 +172,8 @@ class MKCRegression(Inference):
                 return self
             problem = linear_problem(X, Y, sample_weight)
             self._keep(problem, *self._maximise(problem, known))
+            if Y.dim() == 1 and sample_weight is None:
+                warn_of_followed_rows("MKCRegression", X, Y, self.coef_, self.weights_.squeeze(-1))
         return self
 
     def _maximise(self, problem: LinearProblem, known: FixedParameters) -> tuple[RobustStart, LikelihoodMaximum]:
@@ -211,6 +230,7 @@ class MKCRegression(Inference):
         self.weights_ = restored(weights)
         self.history_ = torch.stack([restored(h) for h in found.history])
         self.n_iter_ = len(found.history) - 1
+        self.one_sided_bias_ = torch.zeros_like(self.coef_)
         flag = torch.ones(values.batch, dtype=torch.bool, device=values.Y.device)
         self.converged_, self.exact_fit_ = flag, ~flag
 
@@ -229,3 +249,19 @@ class MKCRegression(Inference):
         self.converged_ = problem.restore(maximum.converged | begin.exact)
         self.dof_ = problem.restore(residual_dof(problem))
         self.covariance_ = coefficient_covariance(problem, maximum.beta, kappa, d, self.covariance, self.bandwidth)
+        if self.covariance == "sandwich":  # the skewness of a time series has another standard error
+            self.one_sided_bias_ = problem.restore(one_sided_bias(problem, maximum.beta))
+
+    def confidence_interval(self, level: float = 0.95) -> Float[Tensor, "*batch n 2"]:
+        """Confidence interval of each coefficient; see :meth:`Inference.confidence_interval`.
+
+        ``one_sided_bias_`` is added to the standard error in quadrature, because outliers of about three scales on one
+        side move the estimate without a trace in ``covariance_``.
+        """
+        narrow = super().confidence_interval(level)
+        error, bias = self.standard_error_, getattr(self, "one_sided_bias_", None)
+        if bias is None:
+            return narrow
+        ratio = torch.where(error > 0, torch.hypot(error, bias) / torch.where(error > 0, error, 1.0), 1.0)
+        half = torch.where(error > 0, ratio * 0.5 * (narrow[..., 1] - narrow[..., 0]), 0.0)
+        return torch.stack([self.coef_ - half, self.coef_ + half], -1)

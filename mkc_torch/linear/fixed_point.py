@@ -23,6 +23,7 @@ from mkc_torch._support.torch_internals import functorch_is_active
 from mkc_torch.linear._implicit.layer import GivenParameters, fit_layer, needs_derivatives
 from mkc_torch.linear._implicit.stationary import FitState
 from mkc_torch.linear._inference import Inference
+from mkc_torch.linear._leverage import warn_of_followed_rows
 from mkc_torch.linear._mkc import (
     channel_parameter,
     coefficient_covariance,
@@ -207,6 +208,9 @@ class FixedPointLinear(Inference):
     def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> FixedPointLinear:
         """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. Weights multiply the loss of each value.
 
+        Warns:
+            UserWarning: the fit follows bad leverage points; the message names their rows.
+
         Raises:
             ValueError: σ or d not positive or of the wrong shape, or bad input as in :meth:`LeastSquares.fit`.
             NotDifferentiableError: in the backward pass, for a fit that has no derivative.
@@ -217,6 +221,8 @@ class FixedPointLinear(Inference):
         self.__dict__.pop("differentiable_", None)
         with torch.no_grad():
             self._fit(X, Y, sample_weight)
+            if Y.dim() == 1 and sample_weight is None:
+                warn_of_followed_rows("FixedPointLinear", X, Y, self.coef_, self.weights_.squeeze(-1))
         return self
 
     def _fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +10,9 @@ import numpy as np
 
 from mkc_torch._support.files import write_atomically
 from mkc_torch.recording.formats import check_ending, encoded, read_topics
-from mkc_torch.recording.formats.base import polars
+from mkc_torch.recording.formats.base import Topic, polars
 from mkc_torch.recording.formats.cells import as_numbers
-from mkc_torch.recording.formats.csv import CSV
+from mkc_torch.recording.formats.csv import CSV, encoded_series
 from mkc_torch.recording.row_sensors import with_row_sensors
 
 if TYPE_CHECKING:
@@ -23,7 +23,13 @@ _LEADING_ZERO = r"^\s*[+-]?0\d"
 
 
 def write_with_columns(
-    source: Path, path: Path, columns: Mapping[str, Tensor], *, topic: int = 0, overwrite: bool = False
+    source: Path,
+    path: Path,
+    columns: Mapping[str, Tensor],
+    *,
+    topic: int = 0,
+    overwrite: bool = False,
+    topics: Sequence[Topic] | None = None,
 ) -> tuple[str, ...]:
     """Write the columns of a file in their order, with further columns replaced by name or appended.
 
@@ -36,6 +42,7 @@ def write_with_columns(
         columns: name to values, (N,) for the N rows of the file.
         topic: index of the topic if the file holds several.
         overwrite: replace an existing file.
+        topics: the file's tables if they have been read already.
 
     Returns:
         The names of the written columns.
@@ -45,7 +52,7 @@ def write_with_columns(
         FileExistsError: the target exists and ``overwrite`` is False.
     """
     check_ending(path)
-    topics = read_topics(source)
+    topics = read_topics(source) if topics is None else topics
     if any(len(values) != len(topics[min(topic, len(topics) - 1)].table.lines) for values in columns.values()):
         topics = with_row_sensors(topics)  # the rows of a single sensor
     table = topics[topic].table
@@ -56,8 +63,13 @@ def write_with_columns(
         while not name and name in written:
             name += " "  # blanks make empty names unique and are stripped on reading
         written[name] = _texts(series) if as_text else _typed(series) if of_text else series
-    written |= {name: values.numpy() for name, values in columns.items()}
-    write_atomically(path, encoded(path, written), overwrite=overwrite)
+    if as_text:
+        written |= {name: _number_texts(values.numpy()) for name, values in columns.items()}
+        content: str | bytes = encoded_series(path, written)
+    else:
+        written |= {name: values.numpy() for name, values in columns.items()}
+        content = encoded(path, written)
+    write_atomically(path, content, overwrite=overwrite)
     return tuple(written)
 
 
@@ -72,18 +84,27 @@ def _typed(series: Any) -> Any:
     return whole if whole.null_count() == numbers.null_count() else numbers
 
 
-def _texts(series: Any) -> np.ndarray:
-    """The text of each cell, empty for missing values."""
+def _texts(series: Any) -> Any:
+    """The text of each cell, null for missing values and empty text."""
     package = polars()
     if series.dtype == package.Float64:
-        cells = [None if value is None else repr(value) for value in series.to_list()]
-    elif series.dtype.is_temporal():
-        cells = series.dt.to_string("iso").to_list()
+        return _number_texts(series.to_numpy()).zip_with(series.is_not_null(), package.Series([None]))
+    if series.dtype.is_temporal():
+        cells = series.dt.to_string("iso")
     elif series.dtype.is_nested() or series.dtype in (package.Binary, package.Object):
-        cells = [None if value is None else str(_plain(value)) for value in series.to_list()]
+        texts = [None if value is None else str(_plain(value)) for value in series.to_list()]
+        cells = package.Series(texts, dtype=package.String)
     else:
-        cells = series.cast(package.String).to_list()
-    return np.array(["" if cell is None else cell for cell in cells], dtype=object)
+        cells = series.cast(package.String)
+    return cells.zip_with(cells != "", package.Series([None], dtype=package.String))
+
+
+def _number_texts(values: np.ndarray) -> Any:
+    """Numbers for the writer, which writes the shortest text that is read back as the same number."""
+    package = polars()
+    if values.dtype.kind != "f" or bool(np.isfinite(values).all()):
+        return package.Series(values)
+    return package.Series([repr(value) for value in values.tolist()], dtype=package.String)
 
 
 def _plain(value: Any) -> Any:

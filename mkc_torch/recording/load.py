@@ -30,6 +30,7 @@ from mkc_torch.recording.formats.text_cells import SEPARATORS
 from mkc_torch.recording.given_columns import EXPERIMENT
 from mkc_torch.recording.join_topics import join_topics
 from mkc_torch.recording.joined_times import with_joined_times
+from mkc_torch.recording.logged_correction import raw_readings
 from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.runs import restarts
 
@@ -144,11 +145,16 @@ def load_table(
                 continue
             else:
                 raise text_error(path, table, name, series, int(bad.arg_max()))
-        elif warning := missing_warning(table, name, series):
+        elif numbers.null_count() and (warning := missing_warning(table, name, series)):
             warnings.append(warning)
         values[name] = torch.tensor(
             converted(series, numbers, known.conversions.get(name)).fill_null(math.nan).to_numpy()
         )
+    if choice.sensor is not None or set(_MAG) <= set(columns or {}):
+        factor = known.conversions["mag_x"].factor if "mag_x" in known.conversions else 1.0
+        raw, sentences = raw_readings(topic, choice.columns, values, float(factor), _unit(known))
+        values |= raw
+        warnings += sentences
     if not values:
         separators = f"separators can be {', '.join(SEPARATORS.values())}"
         raise RecordingError(
@@ -179,6 +185,10 @@ def load_table(
     own = {name: unit for name, unit in known.labels.items() if name in values}
     which = "" if choice.sensor is None else choice.sensor.name
     return LoadedTable(values, own, labels, warnings, choice.topic, which, known.with_stated_unit & set(values))
+
+
+def _unit(known: Units) -> str:
+    return known.labels.get("mag_x", DEFAULT_UNITS["mag_x"])
 
 
 def _clock(path: Path, table: Table, series: Any, known: Units) -> TimeAxis | None:

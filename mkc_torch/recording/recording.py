@@ -21,6 +21,7 @@ from mkc_torch.recording.formats import check_ending, encoded
 from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, Topic, listed
 from mkc_torch.recording.given_columns import EXPERIMENT, checked_columns, columns_of_frame, table_of_frame
 from mkc_torch.recording.load import REQUIRED_COLUMNS, load_table, read_file
+from mkc_torch.recording.missing_axes import without_values
 from mkc_torch.recording.preview import TablePreview
 from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.time_order import note_if_few, time_order
@@ -276,7 +277,7 @@ class Recording(TablePreview):
         if not keep.any():
             raise RecordingError(
                 f"{self._in()}no sample has finite values in all of {listed(names)}: {'; '.join(counts)}. "
-                "Leave out the columns that hold no values."
+                f"{without_values([name for name in names if not bool(self[name].isfinite().any())])}"
             )
         lost = int((~keep).sum())
         dropped = f"Dropped {lost} of {len(self)} samples that are not finite: {'; '.join(counts)}."

@@ -99,7 +99,10 @@ def _part(topic: Topic, column: str, labels: Any, value: str, values: Sequence[s
     lines = [line for line, taken in zip(table.lines, rows.to_list(), strict=True) if taken]
     note = Note(f"The column `{column}` identifies the sensor of each row: {listed(called)}.")
     part = Table(names, [table.series[i].filter(rows) for i in kept], lines, table.line)
-    return Topic(_called(column, value), part, topic.units, (*topic.warnings, note))
+    correction = topic.correction
+    if correction is not None and correction.offsets is not None:
+        correction = correction._replace(offsets=correction.offsets[rows.to_numpy()])
+    return Topic(_called(column, value), part, topic.units, (*topic.warnings, note), correction=correction)
 
 
 def _called(column: str, value: str) -> str:

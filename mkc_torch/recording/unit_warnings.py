@@ -20,7 +20,7 @@ _AXES = "xyz"
 _FIELD = (10.0, 200.0)
 """Plausible range of a measured field, in µT; the Earth's field is 22 to 67, iron nearby and gains change it."""
 
-_EARTH = (20.0, 70.0)
+EARTH = (20.0, 70.0)
 """Range of the Earth's field, in µT."""
 
 _GUESSES = (
@@ -50,6 +50,12 @@ _SCATTER = 0.25
 _ASIDE = 0.7
 """Largest length of the mean direction from the centre of a sensor that turned; without turns, field and offset cannot
 be separated."""
+
+_SLOW_LOGGER = 10.0
+"""Longest sampling interval in s of a logger that is slow; below it, the other unit must fit the motion too."""
+
+_FASTEST = 35.0
+"""Fastest turn of a sensor in rad/s, the range of a gyroscope of 2000 °/s; a faster turn is another unit of time."""
 
 _TIMES = ((1e3, "ms", 1e-3), (1e6, "µs", 1e-6), (math.inf, "ns", 1e-9))
 """Upper bound of the sampling interval in units of ``time``, the likely unit, and its size in s."""
@@ -194,7 +200,7 @@ def _other_unit(size: float, before: str) -> str:
     raw = size / float(known.factor) if known is not None else math.nan
     for option in ("uT", "gauss", "mG", "nT", "tesla", "mT"):
         other = conversion("mag", option)
-        if other is not None and _EARTH[0] <= raw * float(other.factor) <= _EARTH[1]:
+        if other is not None and EARTH[0] <= raw * float(other.factor) <= EARTH[1]:
             return option
     return ""
 
@@ -255,12 +261,27 @@ def time_warning(recording: Recording) -> str | None:
     if interval < 1.0 or "mag_x" not in recording:
         return None
     unit, seconds = next((u, s) for limit, u, s in _TIMES if interval < limit)
+    if interval < _SLOW_LOGGER and _turn_per_sample(recording) / (interval * seconds) > _FASTEST:
+        return None
     option = unit.replace("µ", "u")
     return (
         f"The samples lie {_shown(interval)} s apart by the column `time`, which looks like {unit} "
         f"({_shown(1.0 / (interval * seconds))} samples a second then). Nothing was converted: "
         f"if it is, give `--convert time={option}`."
     )
+
+
+def _turn_per_sample(recording: Recording) -> float:
+    """Median angle in rad by which the field turns from one sample to the next, about its centre; 0 if unknown."""
+    axes = [f"mag_{axis}" for axis in _AXES]
+    if not all(name in recording for name in axes):
+        return 0.0
+    field = recording.stack(*axes)[:_ENOUGH]
+    field = field[field.isfinite().all(-1)].to(torch.float64)
+    if len(field) < _FEWEST:
+        return 0.0
+    direction = torch.nn.functional.normalize(field - _center(field), dim=-1)
+    return float((direction[1:] * direction[:-1]).sum(-1).clamp(-1.0, 1.0).acos().median())
 
 
 def _shown(value: float) -> str:

@@ -133,6 +133,17 @@ def known_units(quantity: str) -> str:
     return ", ".join(_WORDS.get(quantity, {}))
 
 
+def factors(quantity: str) -> dict[str, float]:
+    """The known units of a quantity, as typed on a keyboard, and their factors to its canonical unit.
+
+    Example:
+        >>> factors("accel")["g"], list(factors("mag"))
+        (9.80665, ['uT', 'nT', 'mT', 'tesla', 'gauss', 'mG'])
+    """
+    typed = {"µT": "uT", "milligauss": "mG", "m/s²": "m/s2"}
+    return {typed.get(unit, unit): float(factor) for unit, (factor, _) in _WORDS.get(quantity, {}).items()}
+
+
 def _tidied(text: str) -> str:
     """Normalise the spelling of a unit: micro signs, blanks, superscripts, capitals.
 

@@ -2,6 +2,7 @@ import dataclasses
 import json
 import math
 import re
+import sys
 
 import pytest
 import torch
@@ -355,3 +356,13 @@ def test_a_disturbed_recording_has_the_semi_axes_of_the_undisturbed_recording():
     assert c.semi_axes == pytest.approx((44.17, 44.50, 45.61), abs=0.6)
     assert 0.02 < c.rejected_share < 0.1
     assert c.disturbed
+
+
+def test_a_long_recording_is_thinned_evenly_with_a_note(monkeypatch):
+    points = noisy_ellipsoid(3000)
+    whole = calibrate(recorded(points))
+    monkeypatch.setattr(sys.modules["mkc_torch.calibration.calibrate"], "MOST_SAMPLES", 1000)
+    found = calibrate(recorded(points))
+    assert (whole.samples, found.samples) == (3000, 1000)
+    assert any("one in 3 is used" in note for note in found.notes)
+    assert found.center == pytest.approx(whole.center, abs=6 * max(found.center_se))

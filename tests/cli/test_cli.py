@@ -240,7 +240,7 @@ def test_a_doubtful_calibration_exits_with_three(tmp_path):
     result = mkc("calibrate", path, "--output", tmp_path)
     assert result.exit_code == 3
     first = " ".join(result.output.split()[:30])
-    assert "doubtful: the field's length scatters no less than before" in first
+    assert "Doubtful: the field's length scatters no less than before" in first
     assert (tmp_path / "quadrotor_compass3" / "calibration.json").exists()
 
 
@@ -366,10 +366,10 @@ def test_apply_never_overwrites_what_it_reads(demo, tmp_path):
     assert (tmp_path / "soft.csv").is_symlink()
 
 
-def test_apply_warns_of_a_recording_in_another_unit(demo, tmp_path):
+def test_apply_warns_of_a_recording_at_another_place(demo, tmp_path):
     folder, _ = demo
     mine = Recording.read(folder / "recording.csv")
-    other = table(tmp_path / "other.csv", 1e3 * mine.magnetometer())
+    other = table(tmp_path / "other.csv", 1.3 * mine.magnetometer())
     result = mkc("apply", folder / "calibration.json", other, "--output", tmp_path / "o.csv")
     assert result.exit_code == 0
     assert "times the 48.2 µT of the calibrated recording" in result.stdout

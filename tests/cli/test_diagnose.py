@@ -144,8 +144,8 @@ def test_the_model_has_the_unit_and_the_strength_of_the_field(step_diagnosis, tm
     _, folder, _ = step_diagnosis
     new = sensor_columns(7, step=1.0, start=100.0)
     other = table(tmp_path / "other.csv", {n: 1e3 * v if n.startswith("mag_") else v for n, v in new.items()})
-    result = mkc("apply", folder / "model.json", other, "--output", tmp_path / "corrected.csv")
-    assert " µT of the calibrated recording; check the unit" in result.stdout
+    command = ("apply", folder / "model.json", other, "--output", tmp_path / "corrected.csv")
+    assert_refused(mkc(*command), "`--convert mag=nT`")
     content = json.loads((folder / "model.json").read_text(encoding="utf-8"))
     del content["state"]["unit"], content["state"]["strength"]  # of an earlier version
     (tmp_path / "old.json").write_text(json.dumps(content), encoding="utf-8")

@@ -85,3 +85,42 @@ def test_defaults_of_the_command_line_equal_those_of_diagnose():
     for name in ("LEVEL", "SURROGATES", "MAX_FINDINGS"):
         assert getattr(diagnosis_request, name) == getattr(module, name)
     assert diagnosis_request.INPUT_HOLDS == declared.BETWEEN
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "there is no such file"),
+        ("", "the file is empty"),
+        ("time,ux,uy,uz\n0,1,2,3\n1,2,3,4\n", "`--columns mag_x=ux,mag_y=uy,mag_z=uz`"),
+        ("time,mag_x,mag_y,mag_z\n0,1,2,3\n1,2,3\n2,3,4,5\n", "line 3 has 3 values"),
+    ],
+)
+@pytest.mark.parametrize("command", [("calibrate",), ("apply", "calibration.json")])
+def test_an_unreadable_recording_is_refused_without_torch(tmp_path, text, words, command):
+    if command[0] == "apply" and words.startswith("`--columns"):
+        pytest.skip("the model of the user's simulation takes any columns")
+    if text is not None:
+        (tmp_path / "new.csv").write_text(text)
+    (tmp_path / "calibration.json").write_text("{}")
+    code = "import sys; sys.modules['torch'] = None; from mkc_torch.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *command, "new.csv", "--output", "out.csv"],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+        timeout=60,
+    )
+    assert done.returncode == 1, done.stderr
+    assert done.stderr.startswith("mkc: new.csv: ")
+    assert words in done.stderr
+
+
+def test_a_missing_calibration_is_refused_without_torch(tmp_path):
+    code = "import sys; sys.modules['torch'] = None; from mkc_torch.cli import main; main()"
+    arguments = ("export", "none.json", "--to", "px4", "--output", "out.params")
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False, cwd=tmp_path, timeout=60
+    )
+    assert (done.returncode, done.stderr) == (1, "mkc: none.json: there is no such file.\n")

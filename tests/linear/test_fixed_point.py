@@ -115,11 +115,13 @@ def test_hbk_from_the_named_s_start_has_the_published_solution():
     torch.testing.assert_close(fit.coef_, published_coef("hbk", 1.5, "s"), rtol=1e-5, atol=0)
 
 
+@pytest.mark.filterwarnings("ignore:FixedPointLinear follows the bad leverage points:UserWarning")
 def test_hbk_from_least_squares_ends_at_the_published_local_minimum():
     fit = FixedPointLinear(sigma=1.5, d=1.0, start="least_squares").fit(*DATA_SETS["hbk"]())
     torch.testing.assert_close(fit.coef_, published_coef("hbk", 1.5, "least_squares"), rtol=1e-5, atol=0)
 
 
+@pytest.mark.filterwarnings("ignore:FixedPointLinear follows the bad leverage points:UserWarning")
 def test_the_robust_minimum_is_kept_where_leverage_points_form_a_lower_minimum():
     X, y = DATA_SETS["hbk"]()
     fit = FixedPointLinear(sigma=1.5, d=1.0).fit(X, y)

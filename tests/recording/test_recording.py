@@ -698,3 +698,17 @@ def test_a_datetime_column_is_refused_as_field(tmp_path):
     frame.with_columns(pl.col("mag_x").cast(pl.Datetime)).write_parquet(path)
     with pytest.raises(RecordingError, match="column `mag_x` holds no number at row 1"):
         Recording.read(path)
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        ({"mag_z": [math.nan] * 3}, "The axis z of the magnetometer is dead.*record again.*--columns mag_z=COLUMN"),
+        ({"mag_y": [math.inf] * 3, "mag_z": [math.nan] * 3}, "axes y, z of the magnetometer are dead"),
+        ({"mag_y": [1, math.nan, math.nan], "mag_z": [math.nan, 1, 1]}, "resample them to common times"),
+    ],
+)
+def test_an_axis_without_values_has_advice(columns, words):
+    axes = {name: torch.tensor(columns.get(name, [1.0, 2.0, 3.0])) for name in ("mag_x", "mag_y", "mag_z")}
+    with pytest.raises(RecordingError, match=words):
+        Recording(axes).finite("mag_x", "mag_y", "mag_z")

@@ -87,6 +87,15 @@ def test_times_in_other_units_have_a_warning(interval, shown, unit, since):
     assert f"looks like {unit} (50 samples a second then)" in sentence
 
 
+@pytest.mark.parametrize(("turn", "hinted"), [(0.02, True), (1.0, False)])
+def test_a_slow_logger_has_no_hint_if_the_motion_does_not_fit_the_other_unit(turn, hinted):
+    """Of samples 2 s apart: 0.02 rad in 2 ms is a turn by hand, 1 rad is faster than any gyroscope measures."""
+    angle = turn * torch.arange(60).double()
+    axes = {"mag_x": 48.0 * angle.cos(), "mag_y": 48.0 * angle.sin(), "mag_z": 0.0 * angle}
+    found = warnings_of(axes, time=2.0 * torch.arange(60).double())
+    assert any("looks like ms" in sentence for sentence in found) == hinted
+
+
 def test_several_units_have_a_warning_each():
     assert len(warnings_of(vector("mag", 0.5), vector("gyro", 115.0), vector("accel", 1.0))) == 3
 

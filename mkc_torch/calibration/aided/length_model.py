@@ -143,7 +143,8 @@ def circle(measured: Float[Tensor, "N 3"]) -> Circle:
     flat = (measured - middle) @ axes[:, 1:]
     size = float(flat.abs().median()) or 1.0
     flat = flat / size
-    fit = MKCRegression().fit(torch.cat([2.0 * flat, flat.new_ones(len(flat), 1)], -1), flat.square().sum(-1))
+    columns = torch.cat([2.0 * flat, flat.new_ones(len(flat), 1)], -1)
+    fit = MKCRegression().fit(columns.unsqueeze(-2), flat.square().sum(-1, keepdim=True))
     at = fit.coef_[:2]
     radius = math.sqrt(max(float(fit.coef_[2] + at @ at), 0.0))
     return Circle(axes[:, 0], middle + size * axes[:, 1:] @ at, size * radius)

@@ -44,7 +44,8 @@ def text(correction: SensorCorrection, to: Destination) -> Exported:
     """Write a correction as parameters.
 
     Raises:
-        ExportError: an unknown unit, a matrix that mirrors, or a compass number that ArduPilot does not have.
+        ExportError: a field that was corrected before it was logged, an unknown unit, a matrix that mirrors, or a
+            compass number that ArduPilot does not have.
 
     Example:
         >>> eye = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -57,6 +58,7 @@ def text(correction: SensorCorrection, to: Destination) -> Exported:
         raise ExportError(
             f"`--instance` must be 1 to {_INSTANCES}, the numbers of ArduPilot's compasses, but is {number}."
         )
+    correction.refuse_corrected()
     found = converted(correction, "mG", "ardupilot")
     matrix, turned = symmetric(found.matrix, "ardupilot")
     size = float(np.linalg.det(matrix)) ** (1.0 / 3.0) if np.linalg.det(matrix) > 0 else 1.0
@@ -87,11 +89,12 @@ def _comments(correction: SensorCorrection, which: str) -> list[str]:
         f"{MADE_BY}: ArduPilot parameters of the compass {one_line(correction.name)}",
         "field = [DIA ODI] SCALE (reading + OFS) in mG, of readings in the vehicle's axes, after "
         f"COMPASS_ORIENT{which}, which you have to set.",
-        "A log's MAG message is corrected already: it is the raw reading only with OFS, ODI, MOT 0 and DIA, SCALE 1.",
+        "OFS, DIA, ODI and SCALE are totals, which replace the present parameters.",
     ]
     if correction.current is not None:
         comments += [
             "MOT in mG per A of the battery's current is added to the field (old firmware adds it before DIA and ODI);",
+            "add the MOT that was set during the recording.",
             f"it was fitted to the column {one_line(correction.current.column)}, which must be that current.",
         ]
     return comments

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from mkc_torch.calibration.field_covariance import field_covariance
 from mkc_torch.calibration.file import Matrix, Vector
 from mkc_torch.calibration.result import Calibration
+from mkc_torch.recording.logged_correction import corrected_already
 
 MADE_BY = "Made by mkc_torch"
 """Marker in every exported file, by which a later export recognises a file that it may replace."""
@@ -46,6 +47,8 @@ class SensorCorrection:
         field_strength: length of the corrected field during the calibration, in ``field_unit``; None if unknown.
         current: the field of a current; None without a current.
         left_out: warnings about findings that the correction does not contain.
+        corrected_already: sentence on a correction of the measurement before it was logged, which an autopilot would
+            apply a second time; empty if the measurement is raw.
         covariance: covariance of the corrected field of an undisturbed sample, in ``field_unit²``; None if unknown.
 
     Example:
@@ -64,15 +67,36 @@ class SensorCorrection:
     field_strength: float | None = None
     current: CurrentCoefficients | None = None
     left_out: tuple[str, ...] = ()
+    corrected_already: str = ""
     covariance: Matrix | None = None
 
     @staticmethod
     def of(calibration: Calibration) -> SensorCorrection:
         """The correction of a calibration."""
-        c = calibration
+        c, already = calibration, corrected_already(calibration.notes)
         return SensorCorrection(
-            c.name, c.unit, c.center, c.matrix, c.field_unit, c.field_strength, covariance=field_covariance(c)
+            c.name,
+            c.unit,
+            c.center,
+            c.matrix,
+            c.field_unit,
+            c.field_strength,
+            left_out=(already,) if already else (),
+            corrected_already=already,
+            covariance=field_covariance(c),
         )
+
+    def refuse_corrected(self) -> None:
+        """Raise if the measurement was corrected before it was logged: an autopilot needs the total correction.
+
+        Raises:
+            ExportError: it was, by parameters that are not known.
+        """
+        if self.corrected_already:
+            raise ExportError(
+                f"{self.corrected_already} An autopilot needs the total: calibrate the complete log of the autopilot, "
+                "or record with offsets of 0, DIA and SCALE of 1."
+            )
 
 
 class Destination(NamedTuple):

@@ -30,7 +30,8 @@ def text(correction: SensorCorrection, to: Destination) -> Exported:
     """Write a correction as parameters.
 
     Raises:
-        ExportError: an unknown unit, a matrix that mirrors, or a sensor number that PX4 does not have.
+        ExportError: a field that was corrected before it was logged, an unknown unit, a matrix that mirrors, or a
+            sensor number that PX4 does not have.
 
     Example:
         >>> eye = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -48,6 +49,7 @@ def text(correction: SensorCorrection, to: Destination) -> Exported:
             f"`--device-id` must be a whole number from 1 to {_LARGEST_ID}, but is {to.device_id}; `listener "
             "sensor_mag` in PX4's console shows the id."
         )
+    correction.refuse_corrected()
     found = converted(correction, "gauss", "px4")
     scale, turned = symmetric(found.matrix, "px4")
     warnings = [*correction.left_out, *([turned] if turned else []), *_out_of_range(scale)]

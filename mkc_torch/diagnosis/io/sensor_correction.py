@@ -43,6 +43,7 @@ def sensor_correction(model: DiagnosedModel, name: str) -> SensorCorrection:
     kept, current, text = _kept(model, unit)
     matrix, offset = _affine(_reduced(model, kept), unit, None)
     strength = model.state.get("strength")
+    already = str(model.state.get("corrected_already", ""))
     field = None
     if current is not None:
         field = _field_of_current(model, kept, current, unit, offset)
@@ -54,7 +55,8 @@ def sensor_correction(model: DiagnosedModel, name: str) -> SensorCorrection:
         field_unit=unit,
         field_strength=strength if isinstance(strength, float) else None,
         current=field,
-        left_out=tuple(text),
+        left_out=(*([already] if already else []), *text),
+        corrected_already=already,
     )
 
 

@@ -41,7 +41,7 @@ def read_topics(path: Path) -> list[Topic]:
         RecordingError: the file is of an unknown kind, damaged or empty.
         FileNotFoundError: there is no such file.
     """
-    _check_file(path)
+    check_file(path)
     topics = [topic for topic in _format_of(path).topics(path) if any(topic.table.names)]
     if not topics:
         raise RecordingError(f"{path}: no column has a name; the first line must hold the column names.")
@@ -74,7 +74,13 @@ def _format_of(path: Path) -> FileFormat:
     return by_ending[path.suffix.lower()]
 
 
-def _check_file(path: Path) -> None:
+def check_file(path: Path) -> None:
+    """Check that a file exists, is not empty, and has the ending of a known format.
+
+    Raises:
+        RecordingError: it is a folder, empty, or of an unknown kind.
+        FileNotFoundError: there is no such file.
+    """
     markers = [file_format.marker for file_format in FORMATS if file_format.marker]
     if path.is_dir() and not any((path / marker).is_file() for marker in markers):
         raise RecordingError(f"{path}: this is a folder; name a file in it.")
@@ -84,3 +90,4 @@ def _check_file(path: Path) -> None:
         text = path.suffix.lower() in CSV.endings
         advice = "it must hold a header line and rows of numbers" if text else "record it again, or copy the whole file"
         raise RecordingError(f"{path}: the file is empty; {advice}.")
+    _format_of(path)

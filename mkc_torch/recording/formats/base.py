@@ -47,6 +47,24 @@ class Table(NamedTuple):
     with_units: list[Any] | None = None
 
 
+class LoggedCorrection(NamedTuple):
+    """The correction that a logger applied to a magnetometer: ``logged = matrix (reading + offsets)``.
+
+    Attributes:
+        columns: the corrected columns x, y, z.
+        names: names of its parameters, for messages.
+        offsets: (N, 3), in the unit of the columns; None if unknown.
+        matrix: (3, 3); None if unknown.
+        unknown: why it is unknown, as the end of a sentence; empty if it is known.
+    """
+
+    columns: tuple[str, str, str]
+    names: str
+    offsets: np.ndarray | None = None
+    matrix: np.ndarray | None = None
+    unknown: str = ""
+
+
 class Topic(NamedTuple):
     """A table of a file: a topic of a log, a group of measurements, or a whole CSV.
 
@@ -56,6 +74,7 @@ class Topic(NamedTuple):
         units: units that the format states, by column: ``{"timestamp": "us", "x": "gauss"}``.
         warnings: what was found or dropped while the table was read.
         restarts: row indices at which the logger restarted, by a repeated header.
+        correction: correction of a magnetometer before its field was logged; None if there is none.
     """
 
     name: str
@@ -63,6 +82,7 @@ class Topic(NamedTuple):
     units: Mapping[str, str] = MappingProxyType({})
     warnings: tuple[str, ...] = ()
     restarts: tuple[int, ...] = ()
+    correction: LoggedCorrection | None = None
 
 
 class UsualUnit(str):

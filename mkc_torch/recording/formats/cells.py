@@ -54,6 +54,9 @@ def as_numbers(series: Any) -> tuple[Any, Any]:
     """A column as numbers, null if missing, and the mask of cells that are neither numbers nor missing values."""
     package = polars()
     if series.dtype == package.String:
+        numbers = series.cast(package.Float64, strict=False)
+        if not numbers.null_count():
+            return numbers, package.repeat(False, len(series), dtype=package.Boolean, eager=True)
         text = series.str.strip_chars()
         missing = text.is_null() | text.str.to_lowercase().is_in([*MISSING, *MISSING_SIGNS])
         numbers = text.cast(package.Float64, strict=False)

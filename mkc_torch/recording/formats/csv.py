@@ -13,8 +13,9 @@ import numpy as np
 
 from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import FileFormat, RecordingError, Table, Topic, is_number, listed, polars
+from mkc_torch.recording.formats.plain_table import PlainTable, plain_table
 from mkc_torch.recording.formats.text_cells import WHITE, cells_of
-from mkc_torch.recording.formats.text_layout import layout_of
+from mkc_torch.recording.formats.text_layout import Layout, layout_of
 from mkc_torch.recording.formats.text_lines import Line, lines_of
 from mkc_torch.recording.formats.text_numbers import without_thousands, without_units
 
@@ -37,14 +38,15 @@ def topic(path: Path) -> Topic:
     Raises:
         RecordingError: the file is not a table, or its cells are ambiguous.
     """
+    plain = plain_table(path, layout_of)
+    if plain is not None:
+        return _of_plain(path, plain)
     package = polars()
     lines, warnings = lines_of(path)
     lines, more = _plainly_quoted(lines)
     warnings += more
     layout = layout_of(path, lines)
-    names = [name.strip() for name in layout.names]
-    if all(is_number(name) for name in names):
-        raise RecordingError(f"{path}: the first line holds numbers; it must hold the column names: {_EXAMPLE}.")
+    names = _names(path, layout)
     body, separator = _body(layout.rows, layout.separator)
     try:
         frame = package.read_csv(body, separator=separator, has_header=False, infer_schema=False)
@@ -56,11 +58,32 @@ def topic(path: Path) -> Topic:
     changes = [Note("Thousands separators were removed from the numbers."), *changes] if thousands else changes
     bare = [without_units(column) for column in series]
     units = {name: unit for name, (_, unit) in zip(names, bare, strict=True) if unit}
-    units |= {
-        name: unit.strip(" []()") for name, unit in zip(names, layout.units, strict=False) if unit.strip(" -[]()")
-    }
+    units |= _stated_units(names, layout)
     table = Table(names, [column for column, _ in bare], numbers, with_units=series)
     return Topic("", table, units, (*warnings, *layout.warnings, *changes), layout.restarts)
+
+
+def _names(path: Path, layout: Layout) -> list[str]:
+    names = [name.strip() for name in layout.names]
+    if all(is_number(name) for name in names):
+        raise RecordingError(f"{path}: the first line holds numbers; it must hold the column names: {_EXAMPLE}.")
+    return names
+
+
+def _stated_units(names: Sequence[str], layout: Layout) -> dict[str, str]:
+    """The units of the row of units, by column."""
+    pairs = zip(names, layout.units, strict=False)
+    return {name: unit.strip(" []()") for name, unit in pairs if unit.strip(" -[]()")}
+
+
+def _of_plain(path: Path, plain: PlainTable) -> Topic:
+    """The table of a long file of plain numbers, whose cells have no units, quotes or thousands separators."""
+    layout = plain.layout
+    names = _names(path, layout)
+    frame = polars().read_csv(plain.body, separator=layout.separator, has_header=False, infer_schema=False)
+    first = layout.rows[0].number
+    table = Table(names, frame.get_columns(), range(first, first + plain.rows))
+    return Topic("", table, _stated_units(names, layout), tuple(layout.warnings))
 
 
 def _plainly_quoted(lines: list[Line]) -> tuple[list[Line], list[str]]:
@@ -128,17 +151,36 @@ def _may_be_thousands(cells: Any, rows: int) -> bool:
 
 def encoded(path: Path, columns: Mapping[str, np.ndarray]) -> str | bytes:
     """Encode columns as text; the ending .tsv selects tabs as separators."""
-    if all(is_number(name) for name in columns):
-        raise RecordingError(
-            f"{path}: the column names {listed(columns)} are all numbers and would be read as data; use words."
-        )
-    text = io.StringIO()
-    separator = "\t" if path.suffix.lower() == ".tsv" else ","
-    header: Literal[0, 1] = csv.QUOTE_ALL if _needs_quotes(list(columns)) else csv.QUOTE_MINIMAL
-    csv.writer(text, delimiter=separator, lineterminator="\n", quoting=header).writerow(columns)
-    writer = csv.writer(text, delimiter=separator, lineterminator="\n")
+    text = io.StringIO(_header(path, list(columns)))
+    text.seek(0, io.SEEK_END)
+    writer = csv.writer(text, delimiter=_separator(path), lineterminator="\n")
     # csv writes floats by repr, the shortest text that is read back as the same number
     writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
+    return text.getvalue()
+
+
+def encoded_series(path: Path, columns: Mapping[str, Any]) -> bytes:
+    """Encode polars series as text, as :func:`encoded` does arrays; null is an empty cell."""
+    frame = polars().DataFrame([series.alias(str(place)) for place, series in enumerate(columns.values())])
+    text = io.BytesIO()
+    text.write(_header(path, list(columns)).encode())
+    frame.write_csv(text, include_header=False, separator=_separator(path), quote_style="necessary")
+    return text.getvalue()
+
+
+def _separator(path: Path) -> str:
+    return "\t" if path.suffix.lower() == ".tsv" else ","
+
+
+def _header(path: Path, names: Sequence[str]) -> str:
+    """The line of column names."""
+    if all(is_number(name) for name in names):
+        raise RecordingError(
+            f"{path}: the column names {listed(names)} are all numbers and would be read as data; use words."
+        )
+    text = io.StringIO()
+    quoting: Literal[0, 1] = csv.QUOTE_ALL if _needs_quotes(names) else csv.QUOTE_MINIMAL
+    csv.writer(text, delimiter=_separator(path), lineterminator="\n", quoting=quoting).writerow(names)
     return text.getvalue()
 
 

@@ -13,10 +13,13 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic, counted, optional
 from mkc_torch.recording.formats.damage import guarded, lost_warning, no_rows, with_warnings
 from mkc_torch.recording.formats.magic_numbers import check_begins
+from mkc_torch.recording.formats.px4_calibration import magnetometer_correction
 from mkc_torch.recording.formats.px4_units import px4_units
 from mkc_torch.recording.formats.topics import topic_of
 
@@ -24,6 +27,9 @@ _MAGIC = b"ULog\x01\x12\x35"
 _HEADER = 16
 _MOST_FIELDS = 65536
 _DEEPEST = 8
+_BIASES = 4
+"""Magnetometers in a message ``magnetometer_bias_estimate``."""
+
 _LOOK = 4096
 """Reads between two checks for an endless loop."""
 
@@ -51,7 +57,7 @@ def read(path: Path) -> list[Topic]:
         walk = _walk(path)
         log = pyulog.ULog(file)
         warnings = _losses(log, walk)
-        topics = [topic for data in log.data_list if (topic := _topic(data)) is not None]
+        topics = [topic for data in log.data_list if (topic := _topic(data, log)) is not None]
     if not topics:
         raise no_rows(path, "PX4 ULog", warnings)
     return with_warnings(_with_unique_names(topics), warnings)
@@ -69,7 +75,7 @@ class _LoopGuard(io.BufferedReader):
         return super().read(size)
 
 
-def _topic(data: Any) -> Topic | None:
+def _topic(data: Any, log: Any) -> Topic | None:
     kinds = {field.field_name: field.type_str for field in data.field_data}
     columns = {name: values for name, values in data.data.items() if not name.split(".")[-1].startswith("_padding")}
     text = sorted({name.partition("[")[0] for name in columns if kinds.get(name) == "char"})
@@ -77,7 +83,19 @@ def _topic(data: Any) -> Topic | None:
     first = [name for name in ("timestamp",) if name in columns]
     columns = {name: columns[name] for name in [*first, *columns]}
     warnings = [Note(f"Column `{name}` holds text and is left out.") for name in text]
-    return topic_of(f"{data.name}_{data.multi_id}", columns, px4_units(data.name, columns), warnings)
+    topic = topic_of(f"{data.name}_{data.multi_id}", columns, px4_units(data.name, columns), warnings)
+    if topic is None:
+        return None
+    changed = {name for _, name, _ in log.changed_parameters}
+    known = magnetometer_correction(data.name, columns, log.initial_parameters, changed, _bias_estimated(log))
+    return topic._replace(correction=known)
+
+
+def _bias_estimated(log: Any) -> bool:
+    """Whether PX4 estimated a bias of a magnetometer and subtracted it."""
+    estimates = [data.data for data in log.data_list if data.name == "magnetometer_bias_estimate"]
+    names = [f"bias_{axis}[{place}]" for axis in "xyz" for place in range(_BIASES)]
+    return any(bool(np.any(estimate[name])) for estimate in estimates for name in names if name in estimate)
 
 
 def _with_unique_names(topics: list[Topic]) -> list[Topic]:

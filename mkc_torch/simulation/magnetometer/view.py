@@ -14,6 +14,7 @@ from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
 from mkc_torch.calibration.turning import refuse_at_rest, thin_at_rest, turning
 from mkc_torch.linear import LeastTrimmedSquares
 from mkc_torch.nonlinear import NoFitError
+from mkc_torch.recording.logged_correction import corrected_already
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.matrix import MATRIX_OF_VIEW
 from mkc_torch.simulation.ports import Changes, FreeChange, Nearby, Port
@@ -60,8 +61,13 @@ class View(ClosedForm):
 
     @property
     def state(self) -> dict[str, str | float]:
-        """Constants for the correction of another recording: the view, and the field strength with its unit."""
-        return {"view": self.view, "unit": self.unit, "strength": self.strength}
+        """Constants for the correction of another recording: the view, and the field strength with its unit.
+
+        A correction of the field before it was logged that was not undone is a sentence, ``corrected_already``.
+        """
+        already = corrected_already(self.recording.notes)
+        more = {"corrected_already": already} if already else {}
+        return {"view": self.view, "unit": self.unit, "strength": self.strength, **more}
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:
         """A robust guess of the parameters; see :meth:`mkc_torch.simulation.PreparedSimulation.start`."""
