@@ -11,7 +11,8 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole, refuse_not_real
 from mkc_torch._support.arrays import Data, as_tensor
-from mkc_torch._support.student_t import fisher_tail, student_quantile, student_tails
+from mkc_torch._support.fisher_f import fisher_tail
+from mkc_torch._support.student_t import student_quantile, student_tails
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._goodness import robust_r_squared
 from mkc_torch.linear._influence import ScaleInfluence, Scores, degrees_of_freedom, influence, robust_covariance
