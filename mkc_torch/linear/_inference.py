@@ -46,7 +46,8 @@ class Inference(LinearEstimator):
     """Standard errors, intervals and tests of an estimator with ``coef_``, ``covariance_`` and ``dof_``.
 
     Attributes, after ``fit``:
-        covariance_: covariance of the coefficients (*, n, n).
+        covariance_: covariance of the coefficients (*, n, n). That of "sandwich" and "hac" contains N / (N - n) for the
+            degrees of freedom, so that standard errors are √(N / (N - n)) times those of R's robustbase.
         dof_: degrees of freedom, number of values in use minus n, (*,).
         standard_error_: standard error of each coefficient, (*, n).
         p_value_: two-sided p-value of each coefficient being 0, by Student's t, (*, n).
