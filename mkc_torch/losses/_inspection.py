@@ -58,6 +58,12 @@ def training_warnings(
                 f"The optimizer does not have {names} of the loss. Add `*loss.param_groups()` to its parameter groups, "
                 "or make the loss with `learn_sigma=False, learn_d=False`."
             )
+    if loss.schedule is not None and isinstance(optimizer, torch.optim.SGD):
+        found.append(
+            "The optimizer is SGD, whose steps are proportional to the gradient; the gradient of this loss grows as 1 / "
+            "scale while the residuals shrink. Clip it before each step, torch.nn.utils.clip_grad_norm_(parameters, "
+            "1.0), or use an optimizer that adapts its steps, such as AdamW."
+        )
     return tuple(found)
 
 

@@ -243,7 +243,7 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         """Warnings about a training, a sentence each; empty if there are none. Waits for the device.
 
         The checks: a d close to its floor; more than 1 % of the errors beyond a given bound; σ or d missing from the
-        optimizer.
+        optimizer; SGD with the robust objective, whose gradient grows as the residuals shrink and should be clipped.
 
         Args:
             input, target, weight: as in :meth:`forward`; None for the most recent residuals, if the loss keeps them.

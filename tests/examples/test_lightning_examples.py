@@ -205,3 +205,14 @@ def test_the_noise_over_the_input_has_the_spread_of_its_shape(shape):
     x = x / 12.0**0.5 + 0.5
     z = (target - module.FUNCTIONS[function](x)) / spread(x, module.FUNCTIONS[function](x))
     assert z.square().mean().sqrt().item() == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_table_of_optimisers_has_every_rate_and_variant(capsys, monkeypatch):
+    module = load_example("optimisers")
+    monkeypatch.setattr(module, "STEPS", 5)
+    module.main(["--seeds", "1", "--optimisers", "SGD"])
+    rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines()[2:]]
+    assert [float(row[2]) for row in rows] == 2 * list(module.OPTIMISERS["SGD"][2])
+    clipped, scaled = (float(rows[0][k].split("(")[1].rstrip(") ")) for k in (4, 6))
+    assert {len(row) for row in rows} == {3 + len(module.VARIANTS)}
+    assert clipped != scaled
