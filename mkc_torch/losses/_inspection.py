@@ -60,9 +60,9 @@ def training_warnings(
             )
     if loss.schedule is not None and isinstance(optimizer, torch.optim.SGD):
         found.append(
-            "The optimizer is SGD, whose steps are proportional to the gradient; the gradient of this loss grows as 1 / "
-            "scale while the residuals shrink. Clip it before each step, torch.nn.utils.clip_grad_norm_(parameters, "
-            "1.0), or use an optimizer that adapts its steps, such as AdamW."
+            "The optimizer is SGD, whose steps are proportional to the gradient; the gradient of this loss grows as "
+            "1 / scale while the residuals shrink. Clip it before each step, "
+            "torch.nn.utils.clip_grad_norm_(parameters, 1.0), or use an optimizer that adapts its steps, such as AdamW."
         )
     return tuple(found)
 
