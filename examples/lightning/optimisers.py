@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -19,7 +19,7 @@ from mkc_torch import MKCLoss
 
 ROWS, WIDTH, STEPS, BATCH, NOISE, WRONG = 600, 64, 1500, 64, 0.03, 0.2
 
-OPTIMISERS: dict[str, tuple[type[torch.optim.Optimizer], dict[str, Any], tuple[float, ...]]] = {
+OPTIMISERS: dict[str, tuple[Callable[..., torch.optim.Optimizer], dict[str, Any], tuple[float, ...]]] = {
     "SGD": (torch.optim.SGD, {}, (0.01, 0.1, 0.3)),
     "SGD, momentum 0.9": (torch.optim.SGD, {"momentum": 0.9}, (0.003, 0.01, 0.03)),
     "AdamW": (torch.optim.AdamW, {"weight_decay": 1e-2}, (0.003, 0.01)),
