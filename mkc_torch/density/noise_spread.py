@@ -35,7 +35,7 @@ LEVEL = 1e-4
 
 LEAST_RATIO = 2.0
 """Ratio of the largest and the smallest spread of the groups from which a dependence is reported. Of 600 errors of
-equal noise the ratio is 1.5 in the median and 2.2 in one of a hundred draws; ``LEVEL`` rejects those. Set, as ``LEVEL``,
+equal noise the ratio is 1.5 in the median and 2.2 in one of a hundred draws; ``LEVEL`` rejects those. Both were set
 on the first five shapes of examples/lightning/noise_over_input.py and on wrong targets of five kinds."""
 
 
