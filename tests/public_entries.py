@@ -148,6 +148,13 @@ def entries() -> Iterator[Entry]:
         lambda input, target, **options: losses.MKCLoss(2, **options)(input, target),
         {**pair, "sigma": 2.0, "d": 1.0, "bound": 50.0},
     )
+    yield Entry(
+        ("density.TailsOverInput", "density.NoiseSpread"),
+        lambda input, target, features: (
+            losses.MKCLoss(2, sigma=2.0, d=1.0, bound=50.0).tails(input, target, features=features).likelihood_ratio
+        ),
+        {**pair, "features": X},
+    )
     yield Entry(("losses.MKCLoss auto",), lambda input, target: losses.MKCLoss(2)(input, target), pair)
 
     def given() -> Any:

@@ -3,6 +3,7 @@
 from mkc_torch.density.distribution import MKCDistribution
 from mkc_torch.density.fit import DensityFit, fit_density
 from mkc_torch.density.many_kernels import KernelsFit, fit_kernels
+from mkc_torch.density.noise_spread import NoiseSpread, TailsOverInput
 from mkc_torch.density.robustness import (
     bandwidth_for_efficiency,
     breakdown_point,
@@ -19,7 +20,9 @@ __all__ = [
     "DensityFit",
     "KernelsFit",
     "MKCDistribution",
+    "NoiseSpread",
     "Tails",
+    "TailsOverInput",
     "assess_tails",
     "bandwidth_for_efficiency",
     "breakdown_point",

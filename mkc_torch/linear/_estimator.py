@@ -69,6 +69,9 @@ class LinearEstimator(Fitted):
             with other names.
     """
 
+    _may_miss_clean_data = False
+    """Whether the fit of data without outliers may predict worse than their mean."""
+
     coef_: Float[Tensor, "*batch n"]
     weights_: Float[Tensor, "*batch N m"]
     feature_names_in_: tuple[str, ...]

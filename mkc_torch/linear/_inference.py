@@ -11,7 +11,8 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole, refuse_not_real
 from mkc_torch._support.arrays import Data, as_tensor
-from mkc_torch._support.student_t import fisher_tail, student_quantile, student_tails
+from mkc_torch._support.fisher_f import fisher_tail
+from mkc_torch._support.student_t import student_quantile, student_tails
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._goodness import robust_r_squared
 from mkc_torch.linear._influence import ScaleInfluence, Scores, degrees_of_freedom, influence, robust_covariance
@@ -45,7 +46,8 @@ class Inference(LinearEstimator):
     """Standard errors, intervals and tests of an estimator with ``coef_``, ``covariance_`` and ``dof_``.
 
     Attributes, after ``fit``:
-        covariance_: covariance of the coefficients (*, n, n).
+        covariance_: covariance of the coefficients (*, n, n). That of "sandwich" and "hac" contains N / (N - n) for the
+            degrees of freedom, so that standard errors are √(N / (N - n)) times those of R's robustbase.
         dof_: degrees of freedom, number of values in use minus n, (*,).
         standard_error_: standard error of each coefficient, (*, n).
         p_value_: two-sided p-value of each coefficient being 0, by Student's t, (*, n).

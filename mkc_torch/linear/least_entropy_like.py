@@ -34,7 +34,8 @@ class LeastEntropyLike(LinearEstimator):
     H is invariant to the scale of the residuals. A minimum is found from each of several starts: by default least
     squares and n - 1 vectors of its length orthogonal to it, (50)-(51). The minima are equivariant. The starts, as the
     paper defines them, are not: other units of the columns of X give other starts. Bad leverage points can cause a
-    further minimum, often with the least H (the paper's Table 5): inspect all minima.
+    further minimum, often with the least H (the paper's Table 5): inspect all minima. With many coefficients
+    and errors that are all Gaussian, a few large residuals may have less entropy than those of the truth.
 
     The residual is a homogeneous function of (θ, 1), so the descent is over directions, by Newton's method with the
     exact Hessian. It may pass through infinite coefficients. With m channels the mean of the
@@ -72,6 +73,8 @@ class LeastEntropyLike(LinearEstimator):
         >>> fit.coef_.round(decimals=1)
         tensor([1., 2.], dtype=torch.float64)
     """
+
+    _may_miss_clean_data = True
 
     entropy_: Float[Tensor, "*batch"]
     starts_: Float[Tensor, "*batch S n"]

@@ -137,7 +137,8 @@ class MEstimator(RobustInference):
     Args:
         psi: "huber", "hampel", "tukey", "andrews" or "welsch", (13)-(16) of Indiveri (2009).
         tuning: constants of ψ in units of the scale: k; (a, b, c) of "hampel"; 1 / ω of "andrews". Default for
-            95 % efficiency at Gaussian residuals: 1.345; (1.352, 3.156, 7.213); 4.685; 1.339; 2.985.
+            95 % efficiency at Gaussian residuals: 1.345; (1.352, 3.156, 7.213); 4.685; 1.339; 2.985. Hampel's are
+            those of R's robustbase; statsmodels' default (2, 4, 8) has efficiency 0.990.
         scale: "mad", 1.4826 times the median absolute residual (about 0), which needs N >= 2 p, p = ceil(n / m); or
             "proposal2", Huber's, which is smoother and breaks down earlier.
         start: "lad", "lts", "s", "least_squares" or coefficients (*, n); default "lad" for "huber", else "lts".

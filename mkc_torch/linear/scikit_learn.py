@@ -100,6 +100,11 @@ class ScikitLearnRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         self._keep_results()
         return self
 
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.regressor_tags.poor_score = getattr(self.estimator, "_may_miss_clean_data", False)
+        return tags
+
     def predict(self, X: Any) -> Float[np.ndarray, " N"]:
         """``X coef_ + intercept_``, of X (n_samples, n_features).
 

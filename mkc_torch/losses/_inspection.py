@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import fields
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from mkc_torch.density.tails import Tails, assess_tails
+from mkc_torch._support.arguments import refuse_not_real
+from mkc_torch.density.noise_spread import TailsOverInput, spread_over
+from mkc_torch.density.tails import assess_tails
 from mkc_torch.losses._checks import checked_weight, format_channels
 
 NEAR_FLOOR = 2.0
@@ -34,7 +38,7 @@ def training_warnings(
             "targets."
         )
     if loss._bound_was_given and (input is not None or loss.residual_scale is not None):
-        residual, share = _residuals(loss, input, target, weight)
+        residual, share, _ = _rows(loss, input, target, weight)
         beyond = (share * (residual.abs() > bound)).sum(0) / share.sum(0).clamp(min=torch.finfo(share.dtype).tiny)
         far = [int(k) for k in (beyond > MOST_BEYOND).nonzero().flatten()]
         if far:
@@ -54,22 +58,67 @@ def training_warnings(
                 f"The optimizer does not have {names} of the loss. Add `*loss.param_groups()` to its parameter groups, "
                 "or make the loss with `learn_sigma=False, learn_d=False`."
             )
+    if loss.schedule is not None and isinstance(optimizer, torch.optim.SGD):
+        found.append(
+            "The optimizer is SGD, whose steps are proportional to the gradient; the gradient of this loss grows as "
+            "1 / scale while the residuals shrink. Clip it before each step, "
+            "torch.nn.utils.clip_grad_norm_(parameters, 1.0), or use an optimizer that adapts its steps, such as AdamW."
+        )
     return tuple(found)
 
 
-def tails_of(loss: Any, input: Tensor | None, target: Tensor | None, weight: Tensor | None) -> Tails:
+@torch.no_grad()
+def tails_of(
+    loss: Any, input: Tensor | None, target: Tensor | None, weight: Tensor | None, features: Tensor | None
+) -> TailsOverInput:
     """Test of :meth:`mkc_torch.MKCLoss.tails`."""
-    residual, share = _residuals(loss, input, target, weight)
-    if not bool((share.sum(0) > 0).all()):
+    rows = _rows(loss, input, target, weight)
+    if not bool((rows.weight.sum(0) > 0).all()):
         raise ValueError(
             "Expected residuals of every channel but got none; call the loss in training first, or pass `input` and "
             "`target`."
         )
-    return assess_tails(residual, share, bound=loss.bound.to(residual))
+    columns = [] if features is None else _feature_columns(loss, features, input)
+    tails = assess_tails(rows.residual, rows.weight, bound=loss.bound.to(rows.residual))
+    channels = zip(*map(_channels, rows), strict=True)
+    spread = tuple(
+        spread_over(error, share, [("the prediction", prediction), *columns]) for error, share, prediction in channels
+    )
+    return TailsOverInput(**{field.name: getattr(tails, field.name) for field in fields(tails)}, spread=spread)
 
 
-def _residuals(loss: Any, input: Tensor | None, target: Tensor | None, weight: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Residuals and weights, (N, m) each, of the given batch or of the most recent batches."""
+def _feature_columns(loss: Any, features: Tensor, input: Tensor | None) -> list[tuple[str, np.ndarray]]:
+    """Names and values of the columns of features, one value for each sample of the input."""
+    refuse_not_real("features", features)
+    if input is None:
+        raise ValueError(
+            "Expected argument `features` with `input` and `target` but got it alone; the loss does not keep the "
+            "features of its training. Pass those of a validation set."
+        )
+    samples = input.movedim(loss.channel_dim, -1).shape[:-1]
+    if features.shape[:-1] != samples or not bool(torch.isfinite(features).all()):
+        got = tuple(features.shape) if features.shape[:-1] != samples else "NaN or infinity"
+        raise ValueError(
+            f"Expected argument `features` of finite values of shape ({', '.join(map(str, samples))}, p) but got "
+            f"{got}; pass what the network takes, a row for each sample of the input."
+        )
+    return [(f"feature {k}", column) for k, column in enumerate(_channels(features.detach().flatten(0, -2)))]
+
+
+def _channels(values: Tensor) -> list[np.ndarray]:
+    return list(values.detach().double().cpu().numpy().T)
+
+
+class _Rows(NamedTuple):
+    """Residuals, weights and predictions, (N, m) each."""
+
+    residual: Tensor
+    weight: Tensor
+    prediction: Tensor
+
+
+def _rows(loss: Any, input: Tensor | None, target: Tensor | None, weight: Tensor | None) -> _Rows:
+    """Rows of the given batch or of the most recent batches."""
     if input is None or target is None:
         if loss.residual_scale is None:
             raise ValueError(
@@ -77,12 +126,12 @@ def _residuals(loss: Any, input: Tensor | None, target: Tensor | None, weight: T
                 "pass predictions and targets, for example of a validation set."
             )
         recent = loss.residual_scale.recent
-        return recent[0].T, recent[2].T
-    batch = loss._batch(input.detach(), target.detach(), weight)
+        return _Rows(recent[0].T, recent[2].T, recent[1].T)
+    batch = loss._batch(input, target, weight)
     shares = torch.ones_like(batch.input) if weight is None else checked_weight(weight, batch.input, batch.axis)[0]
-    rows = (value.movedim(batch.axis, -1).reshape(-1, loss.num_channels) for value in (batch.error(), shares))
-    residual, share = rows
-    return residual, share
+    prediction = batch.input if batch.counts is None else torch.where(batch.counts, batch.input, 0.0)
+    rows = (batch.error(), shares, prediction)
+    return _Rows(*(value.movedim(batch.axis, -1).reshape(-1, loss.num_channels) for value in rows))
 
 
 def _listed(channels: list[int]) -> str:

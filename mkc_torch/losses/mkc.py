@@ -30,7 +30,7 @@ from mkc_torch.losses._terms import Batch, LossSettings, LossTerms, loss_terms, 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-    from mkc_torch.density.tails import Tails
+    from mkc_torch.density.noise_spread import TailsOverInput
 
 
 class MKCLoss(ChannelCurves, ChannelDensity):
@@ -243,7 +243,7 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         """Warnings about a training, a sentence each; empty if there are none. Waits for the device.
 
         The checks: a d close to its floor; more than 1 % of the errors beyond a given bound; σ or d missing from the
-        optimizer.
+        optimizer; SGD with the robust objective, whose gradient grows as the residuals shrink and should be clipped.
 
         Args:
             input, target, weight: as in :meth:`forward`; None for the most recent residuals, if the loss keeps them.
@@ -261,28 +261,36 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         input: Float[Tensor, "*shape"] | None = None,
         target: Float[Tensor, "*shape"] | None = None,
         weight: Float[Tensor, "*shape"] | Bool[Tensor, "*shape"] | None = None,
-    ) -> Tails:
+        *,
+        features: Float[Tensor, "*samples p"] | None = None,
+    ) -> TailsOverInput:
         """Whether the errors have heavier tails than a Gaussian, and the share expected beyond three d.
 
-        A finite σ is not evidence of heavy tails: it is finite for about half of all Gaussian samples.
+        A finite σ is not evidence of heavy tails: it is finite for about half of all Gaussian samples. Noise whose
+        spread depends on the input has heavy tails too, without any outlier; then the network should predict the
+        spread, with :class:`mkc_torch.MKCHead`.
 
         Args:
             input, target, weight: as in :meth:`forward`; None for the most recent residuals, if the loss keeps them.
+            features: inputs of the network over which the spread is compared, in addition to the predictions: the
+                shape of ``input`` with p columns in place of the channels, and as the last dimension.
 
         Returns:
-            A :class:`mkc_torch.density.Tails` at the loss's bound; ``print`` shows a line for each channel.
+            A :class:`mkc_torch.density.TailsOverInput` at the loss's bound; ``print`` shows a line for each channel.
 
         Raises:
-            ValueError: no residuals: none were passed, and the loss keeps none or has seen none yet.
+            TypeError: features that are not a tensor of real numbers.
+            ValueError: no residuals: none were passed, and the loss keeps none or has seen none yet; features of
+                another shape, not finite, or without ``input``.
 
         Example:
             >>> loss = MKCLoss(1)
-            >>> x = torch.randn(400, 1, generator=torch.Generator().manual_seed(1))
-            >>> _ = loss(x, torch.zeros(400, 1))
+            >>> x, noise = torch.randn(2, 400, 1, generator=torch.Generator().manual_seed(1))
+            >>> _ = loss(x, x + noise)
             >>> print(loss.tails())
             Gaussian
         """
-        return tails_of(self, input, target, weight)
+        return tails_of(self, input, target, weight, features)
 
     def _tensors(self, batch: Batch) -> list[Tensor]:
         given = (batch.input, batch.target, batch.weight, self.raw_kappa, self.raw_d)

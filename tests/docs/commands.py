@@ -70,6 +70,8 @@ TESTED = {
     "examples/lightning/speed.py": "test_lightning_examples.py",
     "examples/lightning/noisy_labels.py": "test_noisy_labels.py",
     "examples/lightning/wrong_targets.py": "test_lightning_examples.py",
+    "examples/lightning/noise_over_input.py": "test_lightning_examples.py",
+    "examples/lightning/optimisers.py": "test_lightning_examples.py",
     "examples/density/heavy_tails.py": "test_heavy_tails.py",
     "examples/estimators/coverage.py": "test_coverage.py",
     "examples/concealed_physics/magnetometer/real_recordings.py": "test_real_recordings.py",

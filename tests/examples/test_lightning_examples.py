@@ -183,3 +183,36 @@ def test_a_cleaner_has_a_held_out_error(wrong_targets):
     reported = wrong_targets.outcomes("diabetes", "one-sided", 0.2, 0, steps=100, cleaner=True)
     assert 0.3 < reported[wrong_targets.CLEANER].error < 5.0
     assert reported[wrong_targets.MKC].precision > 0.6
+
+
+def test_a_row_of_noise_over_the_input_has_every_loss(capsys, monkeypatch):
+    module = load_example("noise_over_input")
+    monkeypatch.setattr(module, "STEPS", 150)
+    module.main(["--shapes", "exponential, unrelated input", "--seeds", "1"])
+    header, _, row, mean = (line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines())
+    assert [name.strip() for name in header[1:-1]] == list(module.LOSSES)
+    assert row[-1].strip() == "1 of 1"
+    assert all(0.1 < float(ratio) < 10.0 for ratio in row[2:-1])
+    assert mean[3].strip() == row[3].strip()
+
+
+@pytest.mark.parametrize("shape", load_example("noise_over_input").SHAPES)
+def test_the_noise_over_the_input_has_the_spread_of_its_shape(shape):
+    module = load_example("noise_over_input")
+    function, spread = module.SHAPES[shape]
+    draws = [module.drawn(shape, seed) for seed in range(40)]
+    x, target = (torch.cat([draw[k] for draw in draws]) for k in (0, 1))
+    x = x / 12.0**0.5 + 0.5
+    z = (target - module.FUNCTIONS[function](x)) / spread(x, module.FUNCTIONS[function](x))
+    assert z.square().mean().sqrt().item() == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_table_of_optimisers_has_every_rate_and_variant(capsys, monkeypatch):
+    module = load_example("optimisers")
+    monkeypatch.setattr(module, "STEPS", 5)
+    module.main(["--seeds", "1", "--optimisers", "SGD"])
+    rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines()[2:]]
+    assert [float(row[2]) for row in rows] == 2 * list(module.OPTIMISERS["SGD"][2])
+    unscaled, scaled = (float(rows[-1][k].split("(")[1].rstrip(") ")) for k in (4, 6))
+    assert {len(row) for row in rows} == {3 + len(module.VARIANTS)}
+    assert unscaled != scaled

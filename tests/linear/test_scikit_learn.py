@@ -15,6 +15,7 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from mkc_torch.linear import (
+    LeastEntropyLike,
     LeastSquares,
     LeastTrimmedSquares,
     MEstimator,
@@ -34,6 +35,7 @@ CHECKED = [
     ReweightedLeastSquares(starts=50),
     LeastSquares(),
     MKCRegression(),
+    LeastEntropyLike(),
 ]
 each_checked = pytest.mark.parametrize("estimator", CHECKED, ids=lambda estimator: type(estimator).__name__)
 
@@ -48,6 +50,16 @@ def expected_failures(_):
 @parametrize_with_checks([ScikitLearnRegressor(inner) for inner in CHECKED], expected_failed_checks=expected_failures)
 def test_the_estimator_checks_of_scikit_learn_pass(estimator, check):
     check(estimator)
+
+
+def test_only_an_estimator_that_may_miss_clean_data_has_the_tag_of_a_poor_score():
+    tagged = [kind for kind in ESTIMATORS if poor_score(ScikitLearnRegressor(make_estimator(kind)))]
+    assert tagged == [LeastEntropyLike]
+    assert not poor_score(ScikitLearnRegressor())
+
+
+def poor_score(regressor):
+    return regressor.__sklearn_tags__().regressor_tags.poor_score
 
 
 def data(count=60, outliers=12):
