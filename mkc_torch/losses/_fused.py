@@ -132,9 +132,9 @@ def reduced_loss(
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         table = channel_table(
             xp,
-            _array(xp, raw_kappa),
+            _own_array(xp, raw_kappa),
             _array(xp, settings.fixed_kappa),
-            _array(xp, raw_d),
+            _own_array(xp, raw_d),
             _array(xp, settings.fixed_d),
             ChannelState(*(_array(xp, entry) for entry in settings.state)),
             follows=settings.follows,
@@ -188,6 +188,11 @@ def _array(xp: Any, value: Tensor | None) -> Any:
         return None
     value = value.detach()
     return value.numpy() if xp is np else value
+
+
+def _own_array(xp: Any, value: Tensor | None) -> Any:
+    """A copy for NumPy: memory that NumPy has seen cannot be freed, as sharded trainings do with parameters."""
+    return _array(xp, value.detach().clone() if xp is np and value is not None else value)
 
 
 def _divisor(xp: Any, batch: Elements, settings: LossSettings) -> Any:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from mkc_torch._support.arguments import format_value, refuse_bad_batch
+from mkc_torch._support.initial_values import is_readable
 from mkc_torch._support.torch_internals import in_backward, is_transformed
 from mkc_torch.losses._channel_density import ChannelDensity, Objective, is_auto
 from mkc_torch.losses._checks import (
@@ -17,6 +18,7 @@ from mkc_torch.losses._checks import (
     checked_axis,
     checked_weight,
     format_channels,
+    format_tensor,
     refuse_no_dimension,
     refuse_other_reduction,
     refuse_other_shapes,
@@ -337,6 +339,9 @@ class MKCLoss(ChannelCurves, ChannelDensity):
 
     def __repr__(self) -> str:
         learned = [n for n, p in (("sigma", self.raw_kappa), ("d", self.raw_d)) if p is not None]
+        unread = [format_tensor(p) for p in (self.raw_kappa, self.raw_d) if p is not None and not is_readable(p)]
+        if unread:
+            return f"MKCLoss({self.num_channels}, {unread[0]}, learns={learned})"
         with torch.no_grad():
             sigma, d, bound = (format_channels(values) for values in (self.sigma, self.d, self.bound))
         if self._follows:

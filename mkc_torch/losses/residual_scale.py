@@ -10,6 +10,7 @@ import torch
 import torch.distributed
 from torch import Tensor, nn
 
+from mkc_torch._support.initial_values import InitialValues, initial_numbers
 from mkc_torch._support.numpy_or_torch import at_least
 from mkc_torch._support.torch_internals import is_wrapped
 
@@ -53,7 +54,7 @@ SMALL_STATE = 64
 """Channels up to which NumPy computes the state on the CPU: its overhead per call is smaller than torch's."""
 
 
-class ResidualScale(nn.Module):
+class ResidualScale(InitialValues):
     """Running robust scale, half range and most recent residuals of each channel, all in buffers.
 
     ``update`` is the only method that changes the state; it is called in training. The scale is the 0.4 quantile of
@@ -92,12 +93,14 @@ class ResidualScale(nn.Module):
     def __init__(self, num_channels: int) -> None:
         super().__init__()
         length = min(MOST_RECENT, max(FEWEST_RECENT, RECENT_IN_ALL // num_channels))
-        self.register_buffer("recent", torch.zeros(3, num_channels, length))
-        self.register_buffer("position", torch.zeros(num_channels, dtype=torch.int64))
-        self.register_buffer("batches", torch.zeros(num_channels, dtype=torch.int64))
-        self.register_buffer("log_scale", torch.zeros(num_channels))
-        self.register_buffer("half_range", torch.ones(num_channels))
-        self.register_buffer("floor", torch.full((num_channels,), FLOOR_IN_SPREAD))
+        wide = initial_numbers("scale", 0.0).expand(num_channels)
+        counter = torch.zeros(num_channels, dtype=torch.int64, device="cpu")
+        self._register("recent", wide.new_zeros(3, num_channels, length))
+        self._register("position", counter)
+        self._register("batches", counter)
+        self._register("log_scale", wide)
+        self._register("half_range", wide + 1.0)
+        self._register("floor", wide + FLOOR_IN_SPREAD)
 
     @property
     def scale(self) -> Float[Tensor, " m"]:
