@@ -48,6 +48,14 @@ class OwnedLoss:
         bound = None if self.loss.fixed_bound is None else self.loss.bound
         return ResidualHistogram(bound, num_channels=self.loss.num_channels)
 
+    def restart(self, trainer: Trainer) -> ResidualHistogram:
+        """Reset the loss, unless the fit resumes from a checkpoint; return an empty histogram."""
+        if trainer.ckpt_path is None:
+            self.loss.reset_parameters()
+        histogram = self.histogram()
+        histogram.to(self.loss.kappa.device)
+        return histogram
+
     def guide(self, guide: Guide | None, trainer: Trainer) -> None:
         """Train the network by a schedule, the guide's or the loss's own, at the pace of this training."""
         own = self.loss.schedule

@@ -15,6 +15,7 @@ from mkc_torch.losses._parameters import ChannelState, logistic, to_d
 from mkc_torch.losses._snapshot import snapshot
 from mkc_torch.losses._state_dict import logit_of_kappa, logit_of_scale, translate
 from mkc_torch.losses._terms import Batch
+from mkc_torch.losses._training_watch import TrainingWatch
 from mkc_torch.losses.bandwidth_schedule import BandwidthSchedule
 from mkc_torch.losses.residual_scale import SCALES_IN_BOUND, ResidualScale
 
@@ -69,6 +70,7 @@ class ChannelDensity(InitialValues):
         self._follows = follows = is_auto(d)
         self._running_at_start = (follows, robust)
         self._add_running_state()
+        self._watch = TrainingWatch()
         self.__dict__["_guide"] = None  # not saved in the state_dict
         kappa = inverse_square(self._sigma_in_range(sigma))
         own_bound = not (bound is None or is_auto(bound))
@@ -124,6 +126,7 @@ class ChannelDensity(InitialValues):
             for module in self.children():
                 module.to(own)
         super().reset_parameters()
+        self._watch = TrainingWatch()
         for module in self.children():
             module.reset_parameters()  # type: ignore[operator]
 

@@ -189,6 +189,12 @@ class MKCLoss(ChannelCurves, ChannelDensity):
                 NaN prediction in float16, so that a gradient scaler sees an overflow. The running scale ignores
                 residuals that are not finite.
         """
+        value = self._value(input, target, weight)
+        if not torch.compiler.is_compiling() and not self._watch.is_done:
+            self._watch.after_forward(self, value)
+        return value
+
+    def _value(self, input: Tensor, target: Tensor, weight: Tensor | None) -> Tensor:
         if runs_kernels(self, input):
             from mkc_torch.losses.kernels.entry import kernel_loss
 
@@ -313,7 +319,9 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         # function transforms have no state; activation checkpointing repeats the forward pass during the backward pass
         if not torch.compiler.is_compiling() and (in_backward() or any(map(is_transformed, self._tensors(batch)))):
             return False
-        scale.update(batch.input, batch.target, batch.weight, batch.axis)
+        growth = scale.update(batch.input, batch.target, batch.weight, batch.axis)
+        if growth is not None:
+            self._watch.warn_of_other_fit(growth)
         if schedule is not None:
             schedule.update(scale)
         return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -46,6 +47,16 @@ SCALES_IN_BOUND = 10.0
 
 FLOOR_IN_SPREAD = 1e-3
 """Floor of d, as a share of the mean absolute deviation of the first residuals."""
+
+OTHER_FIT_RATIO = 6.0
+"""Growth of the residuals from which they seem to be those of another fit: noise-free fits at a large learning rate
+reach 5.8."""
+
+GROWING_RATIO = 1.1
+"""Ratio of the recent residuals' scale to the running scale below which residuals are not examined for growth."""
+
+SETTLED_BATCHES = 100
+"""Batches that form a state: before, the residuals of a single fit may grow."""
 
 TINY = 1e-30
 """Lower limit of logarithms' arguments and of denominators."""
@@ -119,7 +130,7 @@ class ResidualScale(InitialValues):
         target: Float[Tensor, "*shape"],
         weight: Float[Tensor, "*shape"] | Bool[Tensor, "*shape"] | None = None,
         channel_dim: int = -1,
-    ) -> None:
+    ) -> float | None:
         """Update the state by a batch.
 
         Args:
@@ -127,14 +138,20 @@ class ResidualScale(InitialValues):
             target: targets of the same shape.
             weight: non-negative weights or a mask of the same shape; None for 1.
             channel_dim: the dimension of the channels.
+
+        Returns:
+            How many times larger the residuals have become since the state was formed, if that is more than
+            ``OTHER_FIT_RATIO``; else None. It is computed only where NumPy computes the state.
         """
+        growth = None
         rows, spread = self._sampled(prediction, target, weight, channel_dim)
         if len(self.log_scale) <= SMALL_STATE and numpy_may_read(self.log_scale, *rows):
             recent, state = self.recent.numpy(), ScaleState(*(value.numpy() for value in self._state()))
             with np.errstate(over="ignore", invalid="ignore"):
                 batch = rows_of_batch(np, recent.dtype, _arrays(rows), None if spread is None else _arrays(spread))
                 _insert_in_numpy(recent, self.position, batch.rows)
-                state = updated(np, recent, state, batch)
+                state, old = updated(np, recent, state, batch), state
+                growth = residual_growth(recent, int(self.position[0]), old, state)
             state = ScaleState(*(torch.from_numpy(value) for value in state))
         else:
             batch = rows_of_batch(torch, self.recent.dtype, rows, spread)
@@ -145,6 +162,7 @@ class ResidualScale(InitialValues):
             state = updated(torch, self.recent, self._state(), batch)
         for old, new in zip(self._state(), synchronized_state(state), strict=True):
             old.copy_(new)
+        return growth
 
     def _sampled(
         self, prediction: Tensor, target: Tensor, weight: Tensor | None, axis: int
@@ -265,6 +283,30 @@ def updated(xp: Any, recent: Any, old: ScaleState, batch: BatchRows) -> ScaleSta
         half_range=xp.where(first, batch.half_range, xp.where(known, wider, old.half_range)),
         floor=floor,
     )
+
+
+def residual_growth(recent: Any, position: int, old: ScaleState, new: ScaleState) -> float | None:
+    """How many times larger the residuals have become; None up to ``OTHER_FIT_RATIO``, or if the state is young.
+
+    A large batch replaces all recent residuals, and its scale is compared with the running scale. The running scale
+    follows small batches; then the newest quarter of the recent residuals is compared with their oldest half.
+
+    Args:
+        recent: the buffer of :class:`ResidualScale` with this batch, an array of NumPy.
+        position: index that the next residual takes.
+        old, new: the state before and after this batch.
+    """
+    settled = old.batches >= SETTLED_BATCHES
+    growing = settled & (new.log_scale - old.log_scale > RATE * math.log(GROWING_RATIO))
+    if not growing.any():
+        return None
+    length = recent.shape[-1]
+    ordered = recent[:, :, (position + np.arange(length)) % length]
+    parts = (ordered[..., -(length // 4) :], ordered[..., : length // 2])
+    newest, oldest = (weighted_quantile(np, np.abs(part[0]), part[2], QUANTILE) for part in parts)
+    ratio = np.maximum(np.exp((new.log_scale - old.log_scale) / RATE), newest / at_least(np, oldest, TINY))
+    largest = float(np.where(growing & (oldest > 0), ratio, 0.0).max())
+    return largest if largest > OTHER_FIT_RATIO else None
 
 
 def weighted_quantile(xp: Any, values: Any, weight: Any, level: float) -> Any:

@@ -1064,8 +1064,23 @@ def test_a_default_loss_trains_a_network_for_any_sigma_and_d():
     y = 1000.0 * (x @ torch.tensor([[1.0], [-2.0], [0.5]])) + 10.0 * torch.randn(400, 1)
     y[::5] += 1e5
     module = Regression(lr=30.0, sigma=3.0, d="auto", bound="auto", learn_sigma=True, learn_d=True)
-    trainer_of(max_epochs=60).fit(module, loader(x, y))
+    with pytest.warns(UserWarning, match="the optimizer does not have them"):
+        trainer_of(max_epochs=60).fit(module, loader(x, y))
     torch.testing.assert_close(module.net.weight[0].detach(), torch.tensor([1e3, -2e3, 500.0]), rtol=0.05, atol=0.0)
+
+
+@pytest.mark.parametrize("options", [FIXED, LEARNED, {**FIXED, "d": "auto", "bound": "auto"}, {"d": "auto", **LEARNED}])
+def test_a_module_that_is_fitted_again_starts_like_a_new_loss(options):
+    torch.manual_seed(0)
+    x = torch.randn(400, 3)
+    y = x @ torch.tensor([[1.0], [-2.0], [0.5]]) + 0.1 * torch.randn(400, 1)
+    module, expected = Regression(**options), Regression(**options)
+    for fitted, fits in ((module, 2), (expected, 1)):
+        for _ in range(fits):
+            fitted.net.load_state_dict(Regression().net.state_dict())
+            trained(fitted, loader(x, y, shuffle=False), max_epochs=4)
+    for name, value in expected.state_dict().items():
+        torch.testing.assert_close(module.state_dict()[name], value, rtol=0.0, atol=0.0, msg=name)
 
 
 TRUTH = torch.tensor([[1.0], [-2.0], [0.5]])
