@@ -46,7 +46,6 @@ class MKCExpectationMaximization(Callback):
     parameters, and σ is at most ``SIGMA_CAP``.
 
     A fit that does not resume from a checkpoint starts with ``loss.reset_parameters()``, at the constructor's values.
-
     The gradient of the loss is proportional to 1/d². Adam and similar optimisers are not affected; for plain SGD adapt
     the learning rate.
 
@@ -298,6 +297,7 @@ class MKCExpectationMaximization(Callback):
             owned.guide(progress.guide, trainer)
             histogram.set_bound(loss.bound)
         error, weight = histogram.residuals()
+        owned.follow_floor(error, weight)
         own = (loss.kappa, loss.d, loss.bound, loss.d_min)
         kappa, d, bound, d_min = (t.detach().to(histogram.bound, copy=True) for t in own)
         usable = (histogram.count >= MIN_RESIDUALS) & (histogram.weight() > 0)

@@ -17,7 +17,7 @@ from mkc_torch.losses._state_dict import logit_of_kappa, logit_of_scale, transla
 from mkc_torch.losses._terms import Batch
 from mkc_torch.losses._training_watch import TrainingWatch
 from mkc_torch.losses.bandwidth_schedule import BandwidthSchedule
-from mkc_torch.losses.residual_scale import SCALES_IN_BOUND, ResidualScale
+from mkc_torch.losses.residual_scale import FLOOR_IN_SCALE, SCALES_IN_BOUND, ResidualScale
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -280,13 +280,13 @@ class ChannelDensity(InitialValues):
         running, schedule = self._running() if robust else (self.residual_scale, None)
         bound, floor, scale = self.fixed_bound, self.fixed_d_min, None
         if running is not None:
-            log_scale, half_range, own_floor = running.log_scale, running.half_range, running.floor
+            log_scale, half_range = running.log_scale, running.half_range
             if batch is not None:
                 weight = batch.weight
-                _, log_scale, half_range, own_floor = running.with_batch(batch.input, batch.target, weight, batch.axis)
+                _, log_scale, half_range = running.with_batch(batch.input, batch.target, weight, batch.axis)
             scale = log_scale.exp()
             bound = torch.maximum(half_range, SCALES_IN_BOUND * scale) if bound is None else bound
-            floor = own_floor.clone() if floor is None else floor
+            floor = FLOOR_IN_SCALE * scale if floor is None else floor
         assert bound is not None
         assert floor is not None
         state = ChannelState(bound, floor, scale)

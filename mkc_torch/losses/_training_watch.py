@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mkc_torch._support.torch_internals import is_transformed
-
-if TYPE_CHECKING:
-    from mkc_torch.losses._channel_density import ChannelDensity
 
 WATCHED_STEPS = 100
 """Backward passes after which learned parameters that have not changed are reported."""
@@ -42,7 +39,7 @@ class TrainingWatch:
         self.is_done = False
         self.reported_other_fit = False
 
-    def after_forward(self, loss: ChannelDensity, value: Tensor) -> None:
+    def after_forward(self, loss: nn.Module, value: Tensor) -> None:
         """Count a training pass; after ``WATCHED_STEPS`` backward passes, warn of parameters that have not changed."""
         if not value.requires_grad or not loss.training or value.is_meta or is_transformed(value):
             return

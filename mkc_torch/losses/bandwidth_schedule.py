@@ -121,7 +121,9 @@ class BandwidthSchedule(InitialValues):
         step = SELECTION_INTERVAL * self.anneal_step * xp.where(selected.better, up, -up)
         annealing = (old.steps >= self.warmup_steps) & ((weight * xp.abs(residual)).sum(-1) > 0)
         due = old.steps % SELECTION_INTERVAL == 0
-        log_bandwidth = old.log_bandwidth + rate * (xp.log(selected.bandwidth) - old.log_bandwidth)
+        known = selected.bandwidth > 0  # no bandwidth is selected where residuals overflow
+        chosen = xp.log(xp.where(known, selected.bandwidth, 1.0))
+        log_bandwidth = xp.where(known, old.log_bandwidth + rate * (chosen - old.log_bandwidth), old.log_bandwidth)
         share = xp.where(annealing, at_most(xp, at_least(xp, old.share + step, 0.0), 1.0), old.share)
         return ScheduleState(
             steps=old.steps + 1,

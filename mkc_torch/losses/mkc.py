@@ -72,7 +72,7 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         channel_dim: the dimension of the input that holds the channels, 1 for (N, C, H, W); None for the last. An input
             of four dimensions or more whose second and last dimension both have size m needs an explicit value.
         reduction: "none", "mean" (over elements, weighted if weights are given) or "sum".
-        d_min: floor of d, a number or (m,); None means a thousandth of the initial d, or of the spread of the first
+        d_min: floor of d, a number or (m,); None means a thousandth of the initial d, or of the running scale of the
             residuals. The likelihood of a network that interpolates its targets grows without limit as d → 0.
         impl: "auto" runs Triton kernels on a GPU that has them and torch elsewhere; "eager", "compile" or "triton"
             select an implementation. All give the same results.
@@ -171,7 +171,8 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         """The loss of predictions against targets.
 
         Args:
-            input: predictions, any shape whose ``channel_dim`` has size m.
+            input: predictions, any shape whose ``channel_dim`` has size m; (m,) is a single sample of m channels. Give
+                N samples of one channel the shape (N, 1), and the loss ``num_channels=1``.
             target: targets of the same shape; nothing is broadcast.
             weight: non-negative weights, or a boolean mask (True: used); of the shape of the input, with size 1 along
                 dimensions in which it is constant, or without the channel dimension. Elements of weight 0 or False, NaN
@@ -250,8 +251,8 @@ class MKCLoss(ChannelCurves, ChannelDensity):
     ) -> tuple[str, ...]:
         """Warnings about a training, a sentence each; empty if there are none. Waits for the device.
 
-        The checks: a d close to its floor; more than 1 % of the errors beyond a given bound; σ or d missing from the
-        optimizer.
+        The checks: a d close to its floor; errors several times as large as those of the training; more than 1 % of the
+        errors beyond a given bound; σ or d missing from the optimizer.
 
         Args:
             input, target, weight: as in :meth:`forward`; None for the most recent residuals, if the loss keeps them.

@@ -45,8 +45,8 @@ RANGE_DECAY = 0.999
 SCALES_IN_BOUND = 10.0
 """Smallest bound, in scales."""
 
-FLOOR_IN_SPREAD = 1e-3
-"""Floor of d, as a share of the mean absolute deviation of the first residuals."""
+FLOOR_IN_SCALE = 1e-3
+"""Floor of d, in scales: it follows the scale, because a network may learn targets to any share of their spread."""
 
 OTHER_FIT_RATIO = 6.0
 """Growth of the residuals from which they seem to be those of another fit: noise-free fits at a large learning rate
@@ -85,7 +85,6 @@ class ResidualScale(InitialValues):
         batches: number of batches with at least one finite residual of positive weight, (m,).
         log_scale: logarithm of the scale in the unit of the target, (m,).
         half_range: half the range of the residuals, (m,).
-        floor: a thousandth of the spread of the first residuals, (m,).
 
     Example:
         >>> scale = ResidualScale(1)
@@ -99,7 +98,6 @@ class ResidualScale(InitialValues):
     batches: Tensor
     log_scale: Tensor
     half_range: Tensor
-    floor: Tensor
 
     def __init__(self, num_channels: int) -> None:
         super().__init__()
@@ -111,7 +109,6 @@ class ResidualScale(InitialValues):
         self._register("batches", counter)
         self._register("log_scale", wide)
         self._register("half_range", wide + 1.0)
-        self._register("floor", wide + FLOOR_IN_SPREAD)
 
     @property
     def scale(self) -> Float[Tensor, " m"]:
@@ -122,6 +119,11 @@ class ResidualScale(InitialValues):
     def bound(self) -> Float[Tensor, " m"]:
         """Half the range of the residuals, and at least ten scales, in the unit of the target."""
         return torch.maximum(self.half_range, SCALES_IN_BOUND * self.scale)
+
+    @property
+    def floor(self) -> Float[Tensor, " m"]:
+        """Smallest d, a thousandth of the scale, in the unit of the target."""
+        return FLOOR_IN_SCALE * self.scale
 
     @torch.no_grad()
     def update(
@@ -175,8 +177,12 @@ class ResidualScale(InitialValues):
             return rows, None
         return rows, [spaced_rows(values, axis, RANGE_ROWS) for values in given]
 
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        state_dict.pop(prefix + "floor", None)  # earlier states hold it; the scale determines it
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
     def _state(self) -> ScaleState:
-        return ScaleState(self.batches, self.log_scale, self.half_range, self.floor)
+        return ScaleState(self.batches, self.log_scale, self.half_range)
 
     @torch.no_grad()
     def with_batch(self, prediction: Tensor, target: Tensor, weight: Tensor | None, channel_dim: int) -> ScaleState:
@@ -193,7 +199,6 @@ class ScaleState(NamedTuple):
     batches: Any
     log_scale: Any
     half_range: Any
-    floor: Any
 
 
 class BatchRows(NamedTuple):
@@ -215,7 +220,7 @@ def rows_of_batch(xp: Any, dtype: Any, rows: Sequence[Any], more: Sequence[Any] 
     residual, prediction, weight = _residuals(xp, dtype, *rows)
     wide, _, counts = (residual, prediction, weight) if more is None else _residuals(xp, dtype, *more)
     least, most = (xp.where(counts > 0, wide, bound) for bound in (np.inf, -np.inf))
-    half_range = at_least(xp, 0.5 * (xp.amax(most, 0) - xp.amin(least, 0)), 0.0)  # 0 where all weights are 0
+    half_range = at_least(xp, 0.5 * xp.amax(most, 0) - 0.5 * xp.amin(least, 0), 0.0)  # 0 where all weights are 0
     return BatchRows(xp.stack([residual.T, prediction.T, weight.T]), half_range)
 
 
@@ -263,25 +268,16 @@ def updated(xp: Any, recent: Any, old: ScaleState, batch: BatchRows) -> ScaleSta
     candidate = weighted_quantile(xp, size, weight, QUANTILE) / NORMAL_QUANTILE
     # if most residuals are exactly 0, the mean absolute residual replaces the quantile
     candidate = xp.where(candidate > 0, candidate, (size * share).sum(-1))
-    known = (candidate > 0) & (batch.rows[2].sum(-1) > 0)
+    known = (candidate > 0) & (candidate < xp.inf) & (batch.rows[2].sum(-1) > 0)
     first = (old.batches == 0) & known
     new = xp.where(known, xp.log(at_least(xp, candidate, TINY)), old.log_scale)
     rate = at_least(xp, 1.0 / (_cast(xp, old.batches, recent.dtype) + 1.0), RATE)
     log_scale = xp.where(first, new, old.log_scale + rate * (new - old.log_scale))
-    floor = old.floor
-    if xp is not np or first.any():  # only NumPy may branch on a value
-        middle = (residual * share).sum(-1)
-        spread = (xp.abs(residual - middle[..., None]) * share).sum(-1)
-        scale = xp.exp(log_scale)
-        # an offset widens the scale; far outliers widen the spread: take the smaller
-        own = FLOOR_IN_SPREAD * xp.where(spread > 0, xp.minimum(spread, scale), scale)
-        floor = xp.where(first, own, old.floor)
     wider = xp.maximum(batch.half_range, RANGE_DECAY * old.half_range)
     return ScaleState(
         batches=old.batches + known,
         log_scale=log_scale,
         half_range=xp.where(first, batch.half_range, xp.where(known, wider, old.half_range)),
-        floor=floor,
     )
 
 
@@ -377,12 +373,9 @@ def synchronized_state(state: ScaleState) -> ScaleState:
     if not is_distributed():
         return state
     known = (state.batches > 0).to(state.log_scale)
-    share, *shares = average_over_processes([known, known * state.log_scale, known * state.floor])
-    log_scale, floor = (
-        torch.where(share > 0, mean / share.clamp(min=TINY), old)
-        for mean, old in zip(shares, (state.log_scale, state.floor), strict=True)
-    )
+    share, mean = average_over_processes([known, known * state.log_scale])
+    log_scale = torch.where(share > 0, mean / share.clamp(min=TINY), state.log_scale)
     widest = torch.stack([known * state.half_range, state.batches.to(state.half_range)])
     torch.distributed.all_reduce(widest, torch.distributed.ReduceOp.MAX)
     half_range = torch.where(share > 0, widest[0], state.half_range)
-    return ScaleState(widest[1].to(state.batches), log_scale, half_range, floor)
+    return ScaleState(widest[1].to(state.batches), log_scale, half_range)

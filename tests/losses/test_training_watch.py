@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from mkc_torch import MKCLoss
+from mkc_torch import MKCLoss, outliers
 from mkc_torch.losses._training_watch import WATCHED_STEPS
 
 OPTIONS = {
@@ -194,3 +194,53 @@ def test_passes_without_gradients_are_not_training_steps():
         loss.eval().requires_grad_(True)
         for _ in range(WATCHED_STEPS + 2):
             loss(torch.zeros_like(y), y).backward()
+
+
+# --- a network that learns its targets to a small share of their spread
+
+
+def residuals(size, count, seed):
+    """Residuals of which a tenth, the first, are outliers of 30 times the size of the others."""
+    errors = size * torch.randn(count, 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    errors[: count // 10] += 30.0 * size
+    return errors, torch.zeros_like(errors)
+
+
+def learned_to(share, **options):
+    """A loss after a training whose residuals shrink to a share of their first size."""
+    loss = MKCLoss(1, **options).double()
+    optimizer = torch.optim.Adam(loss.param_groups() or [torch.zeros(1)], lr=1e-2)
+    for step in range(250):
+        optimizer.zero_grad()
+        loss(*(value.requires_grad_() for value in residuals(1.0 if step < 3 else share, 200, step))).backward()
+        optimizer.step()
+    return loss
+
+
+@pytest.mark.parametrize("ratio", [1e2, 1e3, 1e4, 1e5, 1e6, 1e7])
+@pytest.mark.parametrize("options", [{}, {"learn_d": False}, {"learn_sigma": False, "learn_d": False}])
+def test_outliers_are_found_whatever_the_ratio_of_spread_and_noise(ratio, options):
+    loss = learned_to(1.0 / ratio, **options)
+    suspects = outliers(loss, *residuals(1.0 / ratio, 4000, 999)).flatten()
+    assert suspects[:400].all()
+    assert not suspects[400:].any()
+    assert loss.d.item() * ratio == pytest.approx(1.0, rel=0.2)
+    assert loss.check() == ()
+
+
+def test_check_advises_to_lower_a_floor_that_the_residuals_have_passed():
+    loss = learned_to(1e-4, d_min=1e-3)
+    (sentence,) = loss.check()
+    assert "close to its floor 0.001" in sentence
+    assert "lower `d_min`" in sentence
+    assert "raise" not in sentence
+    loss = learned_to(1e-4, d_min=1e-9)
+    assert loss.check() == ()
+
+
+def test_check_compares_errors_of_validation_data_with_those_of_the_training():
+    loss = learned_to(1e-2)
+    assert loss.check(*residuals(2e-2, 400, 5)) == ()
+    (sentence,) = loss.check(*residuals(0.2, 400, 5))
+    assert "times as large as those of the training" in sentence
+    assert MKCLoss(1).check(*(value.float() for value in residuals(1e3, 400, 5))) == ()
