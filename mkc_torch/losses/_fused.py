@@ -288,7 +288,7 @@ def _in_pieces(
     learned = table.kappa_by_raw is not None or table.d_by_raw is not None
     if not (learned or table.share is not None or batch.weight is not None) and bool((table.kappa > 0).all()):
         kappa, d = table.kappa.to(dtype), table.d.to(dtype)
-        energy, by_input = fixed_sums(*flat[:2], kappa, d, divisor, wants_input=wants_input)
+        energy, by_input = fixed_sums(flat[0], flat[1], kappa, d, divisor, wants_input=wants_input)
         return ChannelSums(None, energy, None, None), None if by_input is None else by_input.view_as(batch.input)
     by_input = torch.empty_like(flat[0]) if wants_input else None
     sums: list[Any] = [None] * 4

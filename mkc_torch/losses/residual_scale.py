@@ -153,7 +153,11 @@ class ResidualScale(InitialValues):
                 batch = rows_of_batch(np, recent.dtype, _arrays(rows), None if spread is None else _arrays(spread))
                 _insert_in_numpy(recent, self.position, batch.rows)
                 state, old = updated(np, recent, state, batch), state
-                growth = residual_growth(recent, int(self.position[0]), old, state)
+                growth = residual_growth(recent, self.position, old, state)
+            if not is_distributed():
+                for own, value in zip(old, state, strict=True):
+                    own[...] = value
+                return growth
             state = ScaleState(*(torch.from_numpy(value) for value in state))
         else:
             batch = rows_of_batch(torch, self.recent.dtype, rows, spread)
@@ -217,17 +221,21 @@ def rows_of_batch(xp: Any, dtype: Any, rows: Sequence[Any], more: Sequence[Any] 
         rows: predictions, targets and, if any, weights, (k, m) each.
         more: the same of more rows, for the half range; None takes ``rows``.
     """
-    residual, prediction, weight = _residuals(xp, dtype, *rows)
-    wide, _, counts = (residual, prediction, weight) if more is None else _residuals(xp, dtype, *more)
-    least, most = (xp.where(counts > 0, wide, bound) for bound in (np.inf, -np.inf))
-    half_range = at_least(xp, 0.5 * xp.amax(most, 0) - 0.5 * xp.amin(least, 0), 0.0)  # 0 where all weights are 0
-    return BatchRows(xp.stack([residual.T, prediction.T, weight.T]), half_range)
+    stacked = xp.stack([value.T for value in _residuals(xp, dtype, *rows)])
+    wide, _, counts = stacked if more is None else (value.T for value in _residuals(xp, dtype, *more))
+    least = most = wide
+    if xp is not np or not counts.all():  # only NumPy may branch on a value
+        least, most = (xp.where(counts > 0, wide, bound) for bound in (np.inf, -np.inf))
+    half_range = at_least(xp, 0.5 * xp.amax(most, -1) - 0.5 * xp.amin(least, -1), 0.0)  # 0 where all weights are 0
+    return BatchRows(stacked, half_range)
 
 
 def _residuals(xp: Any, dtype: Any, prediction: Any, target: Any, weight: Any = None) -> tuple[Any, Any, Any]:
     prediction, target = _cast(xp, prediction, dtype), _cast(xp, target, dtype)
     residual = prediction - target
     counts = xp.isfinite(residual)
+    if xp is np and weight is None and counts.all():
+        return residual, prediction, np.ones_like(residual)
     if weight is None:
         weight = _cast(xp, counts, dtype)
     else:
@@ -264,10 +272,11 @@ def updated(xp: Any, recent: Any, old: ScaleState, batch: BatchRows) -> ScaleSta
     """
     residual, weight = recent[0], recent[2]
     size = xp.abs(residual)
-    share = weight / at_least(xp, weight.sum(-1), TINY)[..., None]
     candidate = weighted_quantile(xp, size, weight, QUANTILE) / NORMAL_QUANTILE
-    # if most residuals are exactly 0, the mean absolute residual replaces the quantile
-    candidate = xp.where(candidate > 0, candidate, (size * share).sum(-1))
+    if xp is not np or not (candidate > 0).all():
+        # if most residuals are exactly 0, the mean absolute residual replaces the quantile
+        share = weight / at_least(xp, weight.sum(-1), TINY)[..., None]
+        candidate = xp.where(candidate > 0, candidate, (size * share).sum(-1))
     known = (candidate > 0) & (candidate < xp.inf) & (batch.rows[2].sum(-1) > 0)
     first = (old.batches == 0) & known
     new = xp.where(known, xp.log(at_least(xp, candidate, TINY)), old.log_scale)
@@ -281,7 +290,7 @@ def updated(xp: Any, recent: Any, old: ScaleState, batch: BatchRows) -> ScaleSta
     )
 
 
-def residual_growth(recent: Any, position: int, old: ScaleState, new: ScaleState) -> float | None:
+def residual_growth(recent: Any, position: Tensor, old: ScaleState, new: ScaleState) -> float | None:
     """How many times larger the residuals have become; None up to ``OTHER_FIT_RATIO``, or if the state is young.
 
     A large batch replaces all recent residuals, and its scale is compared with the running scale. The running scale
@@ -289,18 +298,20 @@ def residual_growth(recent: Any, position: int, old: ScaleState, new: ScaleState
 
     Args:
         recent: the buffer of :class:`ResidualScale` with this batch, an array of NumPy.
-        position: index that the next residual takes.
+        position: index that the next residual takes, equal for all channels.
         old, new: the state before and after this batch.
     """
-    settled = old.batches >= SETTLED_BATCHES
-    growing = settled & (new.log_scale - old.log_scale > RATE * math.log(GROWING_RATIO))
+    change = new.log_scale - old.log_scale
+    if not change.max() > RATE * math.log(GROWING_RATIO):
+        return None
+    growing = (old.batches >= SETTLED_BATCHES) & (change > RATE * math.log(GROWING_RATIO))
     if not growing.any():
         return None
     length = recent.shape[-1]
-    ordered = recent[:, :, (position + np.arange(length)) % length]
+    ordered = recent[:, :, (int(position[0]) + np.arange(length)) % length]
     parts = (ordered[..., -(length // 4) :], ordered[..., : length // 2])
     newest, oldest = (weighted_quantile(np, np.abs(part[0]), part[2], QUANTILE) for part in parts)
-    ratio = np.maximum(np.exp((new.log_scale - old.log_scale) / RATE), newest / at_least(np, oldest, TINY))
+    ratio = np.maximum(np.exp(change / RATE), newest / at_least(np, oldest, TINY))
     largest = float(np.where(growing & (oldest > 0), ratio, 0.0).max())
     return largest if largest > OTHER_FIT_RATIO else None
 
@@ -308,6 +319,9 @@ def residual_growth(recent: Any, position: int, old: ScaleState, new: ScaleState
 def weighted_quantile(xp: Any, values: Any, weight: Any, level: float) -> Any:
     """Weighted quantile of each channel: the smallest value up to which a share ``level`` of the weight lies, (m,)."""
     if xp is np:
+        if weight.min() == 1.0 == weight.max():
+            rank = min(max(math.ceil(level * values.shape[-1]) - 1, 0), values.shape[-1] - 1)
+            return np.partition(values, rank, -1)[..., rank]
         equal = weight == (weight > 0)
         if equal.all():  # sorting values alone is several times as fast as sorting weights with them
             ordered = np.sort(np.where(weight > 0, values, np.inf), -1)
