@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -72,6 +73,15 @@ class MKCNegativeLogLikelihood(Metric):
         self.per_channel = per_channel
         for name in ("total", "weight"):
             self.add_state(name, torch.zeros(loss.num_channels, dtype=torch.float64), dist_reduce_fx="sum")
+
+    def reset_parameters(self) -> None:
+        """Set the sums to 0, also after ``to_empty``; :meth:`reset` needs the memory of the construction."""
+        for default in self._defaults.values():
+            default.zero_()  # type: ignore[union-attr]
+        self.reset()
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], exclude_state: Sequence[str] = "", **_: Any) -> Any:  # type: ignore[override]
+        return super()._apply(fn, exclude_state)  # torchmetrics lacks the argument that `to_empty` passes
 
     @property
     def loss(self) -> MKCLoss:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from mkc_torch._parallel.deadline import Reason
 from mkc_torch._support.html_table import html_table
+from mkc_torch._support.initial_values import InitialValues
 from mkc_torch._support.typesetting import plain, typeset
 from mkc_torch.diagnosis.decisions import Trail
 from mkc_torch.diagnosis.environment import NoiseEnvironment, Verdict
@@ -122,8 +123,10 @@ def notices(stop: Stop | None, *, quick: bool, too_few: bool = False) -> tuple[s
     return (*(() if stop is None else (str(stop),)), *left_out)
 
 
-class CorrectingModel(nn.Module):
+class CorrectingModel(InitialValues):
     """A simulation's sensor or system with the findings in it; see :class:`mkc_torch.diagnosis.DiagnosedModel`."""
+
+    theta: nn.Parameter
 
     @abstractmethod
     def correct(self, recording: Recording) -> tuple[dict[str, Float[Tensor, " N"]], tuple[str, ...]]:

@@ -11,10 +11,12 @@ from lightning.pytorch import Trainer
 from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
 
+from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.density.energy import KAPPA_MAX
 from mkc_torch.lightning._schedule_pace import Guide, set_pace
 from mkc_torch.lightning.residual_histogram import ResidualHistogram
 from mkc_torch.losses.mkc import MKCLoss
+from mkc_torch.losses.residual_scale import FLOOR_IN_SCALE
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -48,6 +50,14 @@ class OwnedLoss:
         bound = None if self.loss.fixed_bound is None else self.loss.bound
         return ResidualHistogram(bound, num_channels=self.loss.num_channels)
 
+    def restart(self, trainer: Trainer) -> ResidualHistogram:
+        """Reset the loss, unless the fit resumes from a checkpoint; return an empty histogram."""
+        if trainer.ckpt_path is None:
+            self.loss.reset_parameters()
+        histogram = self.histogram()
+        histogram.to(self.loss.kappa.device)
+        return histogram
+
     def guide(self, guide: Guide | None, trainer: Trainer) -> None:
         """Train the network by a schedule, the guide's or the loss's own, at the pace of this training."""
         own = self.loss.schedule
@@ -64,6 +74,15 @@ class OwnedLoss:
         scale, schedule = self.loss.residual_scale, self.loss.schedule
         self.loss.freeze_scale()
         return None if scale is None or schedule is None else Guide(scale, schedule)
+
+    @torch.no_grad()
+    def follow_floor(self, error: Float[Tensor, "N m"], weight: Float[Tensor, "N m"]) -> None:
+        """Set the floor of d from the scale of the residuals, unless the loss was constructed with one."""
+        floor = self.loss.fixed_d_min
+        if floor is None or "fixed_d_min" in self.loss._initial:
+            return
+        scale = torch.where(weight.sum(0) > 0, robust_scale(error, weight), 0.0).to(floor)
+        floor.copy_(torch.where(scale > 0, FLOOR_IN_SCALE * scale, floor))
 
     def release(self) -> None:
         """Release the loss: remove hook and guide, and make its parameters learnable again."""

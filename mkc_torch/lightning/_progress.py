@@ -43,8 +43,8 @@ _WARNINGS = {
     "collapsed": (
         "The d of the loss `{name}` collapses in channel {channels}: it reached its floor `d_min`, or a hundredth of "
         "its first value while the likelihood grows. Either the noise is that small, or the network interpolates its "
-        "targets. Check the loss on a validation set, stop early, use weight decay or a smaller network, or make "
-        "MKCLoss with the smallest possible noise as `d_min`."
+        "targets. Check the errors on a validation set. If they are as small, lower a given `d_min`; if they are "
+        "larger, stop early, use weight decay or a smaller network."
     ),
 }
 

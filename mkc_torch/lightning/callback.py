@@ -45,6 +45,7 @@ class MKCExpectationMaximization(Callback):
     better. If the loss learns σ and d, their gradients are switched off during the fit: no optimiser may have these
     parameters, and σ is at most ``SIGMA_CAP``.
 
+    A fit that does not resume from a checkpoint starts with ``loss.reset_parameters()``, at the constructor's values.
     The gradient of the loss is proportional to 1/d². Adam and similar optimisers are not affected; for plain SGD adapt
     the learning rate.
 
@@ -179,7 +180,7 @@ class MKCExpectationMaximization(Callback):
     @override
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step == 0:
-            self._progress = Progress(self._running()[0].histogram())
+            self._progress = Progress(self._running()[0].restart(trainer))
         owned, progress = self._running()
         if self.graduated and progress.guide is None and owned.loss.schedule is None:
             progress.guide = Guide.of_channels(owned.loss.num_channels)
@@ -296,6 +297,7 @@ class MKCExpectationMaximization(Callback):
             owned.guide(progress.guide, trainer)
             histogram.set_bound(loss.bound)
         error, weight = histogram.residuals()
+        owned.follow_floor(error, weight)
         own = (loss.kappa, loss.d, loss.bound, loss.d_min)
         kappa, d, bound, d_min = (t.detach().to(histogram.bound, copy=True) for t in own)
         usable = (histogram.count >= MIN_RESIDUALS) & (histogram.weight() > 0)

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from mkc_torch._support.arguments import as_numbers
+from mkc_torch._support.initial_values import InitialValues, has_values, initial_numbers
 from mkc_torch.density.energy import KAPPA_MAX, as_computed, inverse_square
 from mkc_torch.density.normalizer import log_partition
 from mkc_torch.losses._parameters import ChannelState, logistic, to_d
 from mkc_torch.losses._snapshot import snapshot
 from mkc_torch.losses._state_dict import logit_of_kappa, logit_of_scale, translate
 from mkc_torch.losses._terms import Batch
+from mkc_torch.losses._training_watch import TrainingWatch
 from mkc_torch.losses.bandwidth_schedule import BandwidthSchedule
-from mkc_torch.losses.residual_scale import SCALES_IN_BOUND, ResidualScale
+from mkc_torch.losses.residual_scale import FLOOR_IN_SCALE, SCALES_IN_BOUND, ResidualScale
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -34,7 +34,7 @@ DEFAULT_LEARNING_RATE = 1e-2
 """Default learning rate of σ and d in :meth:`ChannelDensity.param_groups`."""
 
 
-class ChannelDensity(nn.Module):
+class ChannelDensity(InitialValues):
     """Density of each channel: parameters and running state of a loss, without its computation.
 
     Args:
@@ -48,6 +48,8 @@ class ChannelDensity(nn.Module):
     fixed_d_min: Tensor | None
     fixed_kappa: Tensor | None
     fixed_d: Tensor | None
+    raw_kappa: nn.Parameter | None
+    raw_d: nn.Parameter | None
     residual_scale: ResidualScale | None
     schedule: BandwidthSchedule | None
 
@@ -66,50 +68,89 @@ class ChannelDensity(nn.Module):
         super().__init__()
         self.num_channels = num_channels
         self._follows = follows = is_auto(d)
-        self.residual_scale = ResidualScale(num_channels) if follows or robust else None
-        self.schedule = BandwidthSchedule(num_channels) if robust else None
+        self._running_at_start = (follows, robust)
+        self._add_running_state()
+        self._watch = TrainingWatch()
         self.__dict__["_guide"] = None  # not saved in the state_dict
         kappa = inverse_square(self._sigma_in_range(sigma))
         own_bound = not (bound is None or is_auto(bound))
         self._bound_was_given = own_bound or not follows
-        d = torch.ones(num_channels) if is_auto(d) else self._per_channel("d", d, low=0.0)
+        d = initial_numbers("d", 1.0).expand(num_channels) if is_auto(d) else self._per_channel("d", d, low=0.0)
         half_width = self._per_channel("bound", bound, low=0.0) if own_bound else DEFAULT_BOUND_IN_D * d
         floor = DEFAULT_D_MIN_IN_D * d if d_min is None else self._per_channel("d_min", d_min, low=0.0)
-        if not follows and not bool((half_width > d).all()):
+        if not follows and has_values(half_width, d) and not bool((half_width > d).all()):
             raise ValueError(f"Expected argument `bound` to exceed `d` but got {half_width.tolist()} and {d.tolist()}.")
-        if not follows and learn_d and not bool((floor < d).all()):
+        if not follows and learn_d and has_values(floor, d) and not bool((floor < d).all()):
             raise ValueError(f"Expected argument `d_min` below `d` but got {floor.tolist()} and {d.tolist()}.")
-        self.register_buffer("fixed_bound", half_width if own_bound or not follows else None)
-        self.register_buffer("fixed_d_min", floor if d_min is not None or not follows else None)
-        self.register_buffer("fixed_kappa", None if learn_sigma else kappa)
-        self.register_buffer("fixed_d", None if learn_d or follows else d)
-        self.raw_kappa = nn.Parameter(torch.empty_like(kappa)) if learn_sigma else None
-        self.raw_d = nn.Parameter(torch.zeros_like(d)) if learn_d else None
-        self._set_kappa(kappa)
-        if not follows:
-            self._set_d(d)
+        self._register("fixed_bound", half_width if own_bound or not follows else None)
+        self._register("fixed_d_min", floor if d_min is not None or not follows else None)
+        self._register("fixed_kappa", None if learn_sigma else kappa)
+        self._register("fixed_d", None if learn_d or follows else d)
+        raw_d = torch.zeros_like(d) if follows else logit_of_scale(d, floor, half_width)
+        self._register("raw_kappa", _raw_kappa(kappa) if learn_sigma else None, learned=True)
+        self._register("raw_d", raw_d if learn_d else None, learned=True)
+
+    def _add_running_state(self) -> None:
+        follows, robust = self._running_at_start
+        self.residual_scale = ResidualScale(self.num_channels) if follows or robust else None
+        self.schedule = BandwidthSchedule(self.num_channels) if robust else None
+
+    @torch.no_grad()
+    def reset_parameters(self) -> None:
+        """Set σ, d, the running scale and the schedule to their initial values, for a new fit or after ``to_empty``.
+
+        The parameters stay the same objects. A loss that :meth:`freeze_scale` or a loaded state_dict has frozen takes d
+        and bound from the residuals again, as it was constructed.
+
+        Raises:
+            ValueError: an initial value was given as a tensor of the meta device, which has no values.
+
+        Example:
+            >>> from mkc_torch import MKCLoss
+            >>> loss = MKCLoss(1)
+            >>> for fold in range(5):
+            ...     loss.reset_parameters()
+            ...     _ = loss(torch.randn(20, 1), torch.zeros(20, 1))
+            >>> loss.residual_scale.batches
+            tensor([1])
+        """
+        follows, robust = self._running_at_start
+        if self._follows != follows or (self.residual_scale is None and (follows or robust)):
+            for name in ("fixed_bound", "fixed_d_min", "fixed_d"):
+                if name not in self._initial:
+                    setattr(self, name, None)
+            self._follows = follows
+            self._add_running_state()
+            own = self.raw_kappa if self.fixed_kappa is None else self.fixed_kappa
+            assert own is not None
+            for module in self.children():
+                module.to(own)
+        super().reset_parameters()
+        self._watch = TrainingWatch()
+        for module in self.children():
+            module.reset_parameters()  # type: ignore[operator]
 
     def _per_channel(self, name: str, value: object, *, low: float) -> Tensor:
         if isinstance(value, str) and name in ("d", "bound"):
             raise TypeError(
                 f"Expected argument `{name}` to be a number, a tensor of numbers or 'auto' but got {value!r}."
             )
-        (t,) = as_computed(as_numbers(name, value).detach())
+        (t,) = as_computed(initial_numbers(name, value).detach())
         if t.dim() > 1 or (t.dim() == 1 and t.shape[0] not in (1, self.num_channels)):
             raise ValueError(
                 f"Expected argument `{name}` to be a number or of shape ({self.num_channels},) but got "
                 f"{tuple(t.shape)}; pass one number for each channel, or a single number for all."
             )
-        if not bool(((t > low) & torch.isfinite(t)).all()):
+        if has_values(t) and not bool(((t > low) & torch.isfinite(t)).all()):
             raise ValueError(
                 f"Expected argument `{name}` to be positive and finite but got {value}; its unit is that of the target."
             )
         return t.expand(self.num_channels).clone()
 
     def _sigma_in_range(self, value: float | Tensor) -> Tensor:
-        (t,) = as_computed(as_numbers("sigma", value).detach())
+        (t,) = as_computed(initial_numbers("sigma", value).detach())
         least = KAPPA_MAX**-0.5
-        if not bool((t >= least).all()):
+        if has_values(t) and not bool((t >= least).all()):
             raise ValueError(f"Expected argument `sigma` in [{least:g}, inf] but got {value}; 3 is a usual start.")
         finite = self._per_channel("sigma", torch.where(torch.isinf(t), 1.0, t), low=0.0)
         return torch.where(torch.isinf(t).expand_as(finite), torch.inf, finite)
@@ -125,12 +166,7 @@ class ChannelDensity(nn.Module):
     @torch.no_grad()
     def _set_kappa(self, kappa: Tensor) -> None:
         if self.raw_kappa is not None:
-            if bool((kappa == 0).any()):
-                raise ValueError(
-                    "Expected a finite `sigma` with `learn_sigma=True` but got inf, where its gradient is 0; "
-                    "start large, for example at 10, or pass `learn_sigma=False`."
-                )
-            self.raw_kappa.copy_(logit_of_kappa(kappa))
+            self.raw_kappa.copy_(_raw_kappa(kappa))
         elif self.fixed_kappa is not None:
             self.fixed_kappa.copy_(kappa)
 
@@ -244,13 +280,13 @@ class ChannelDensity(nn.Module):
         running, schedule = self._running() if robust else (self.residual_scale, None)
         bound, floor, scale = self.fixed_bound, self.fixed_d_min, None
         if running is not None:
-            log_scale, half_range, own_floor = running.log_scale, running.half_range, running.floor
+            log_scale, half_range = running.log_scale, running.half_range
             if batch is not None:
                 weight = batch.weight
-                _, log_scale, half_range, own_floor = running.with_batch(batch.input, batch.target, weight, batch.axis)
+                _, log_scale, half_range = running.with_batch(batch.input, batch.target, weight, batch.axis)
             scale = log_scale.exp()
             bound = torch.maximum(half_range, SCALES_IN_BOUND * scale) if bound is None else bound
-            floor = own_floor.clone() if floor is None else floor
+            floor = FLOOR_IN_SCALE * scale if floor is None else floor
         assert bound is not None
         assert floor is not None
         state = ChannelState(bound, floor, scale)
@@ -261,22 +297,9 @@ class ChannelDensity(nn.Module):
         kept = iter(snapshot([value for value in state if value is not None]))
         return ChannelState(*(None if value is None else next(kept) for value in state))
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Keep parameters and buffers in float32 at least: half precision would round them, or overflow."""
-
-        def keep(t: Tensor) -> Tensor:
-            out = fn(t)
-            return t.to(out.device) if out.dtype in (torch.float16, torch.bfloat16) else out
-
-        super()._apply(keep, recurse)  # type: ignore[no-untyped-call]
-        return self
-
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        if (
-            self._follows
-            and prefix + "fixed_bound" in state_dict
-            and prefix + "residual_scale.recent" not in state_dict
-        ):
+        frozen = all(prefix + name in state_dict for name in ("fixed_bound", "fixed_d_min"))
+        if self._follows and frozen and prefix + "residual_scale.recent" not in state_dict:
             self._take_given_numbers()
         translate(
             state_dict,
@@ -315,6 +338,15 @@ class ChannelDensity(nn.Module):
         """
         parameters = [p for p in (self.raw_kappa, self.raw_d) if p is not None]
         return [{"params": parameters, "weight_decay": 0.0, "lr": lr, **options}] if parameters else []
+
+
+def _raw_kappa(kappa: Tensor) -> Tensor:
+    if has_values(kappa) and bool((kappa == 0).any()):
+        raise ValueError(
+            "Expected a finite `sigma` with `learn_sigma=True` but got inf, where its gradient is 0; start large, for "
+            "example at 10, or pass `learn_sigma=False`."
+        )
+    return logit_of_kappa(kappa)
 
 
 def is_auto(value: object) -> bool:

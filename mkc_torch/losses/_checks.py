@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import refuse_bad_weight, refuse_not_real
+from mkc_torch._support.initial_values import is_readable
 
 Reduction = Literal["none", "mean", "sum"]
 
@@ -74,10 +75,19 @@ def checked_weight(weight: Tensor, input: Tensor, axis: int, *, cast: bool = Tru
 
 def format_channels(values: Tensor) -> str:
     """The values as text: one number if all are equal, else a list of the first few."""
+    if not is_readable(values):
+        return format_tensor(values)
     numbers = [f"{value:.4g}" for value in values.tolist()]
     if len(set(numbers)) == 1:
         return numbers[0]
     return f"[{', '.join(numbers[:_SHOWN])}{', …' if len(numbers) > _SHOWN else ''}]"
+
+
+def format_tensor(values: Tensor) -> str:
+    """The values as Python writes them, or where they are if this process cannot read them."""
+    if is_readable(values):
+        return f"{values.tolist()}"
+    return "on the meta device" if values.is_meta else "sharded"
 
 
 def at_least_float32(value: Tensor) -> torch.dtype:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from mkc_torch._support.torch_internals import is_wrapped
 from mkc_torch.density.closed_form import element_energy
+from mkc_torch.losses._fixed_pieces import fixed_sums, pieces
 from mkc_torch.losses._initial_loss import initial_influence, initial_loss
 from mkc_torch.losses._parameters import ChannelState, ChannelTable, channel_table
 from mkc_torch.losses._terms import Batch, LossSettings, loss_value
@@ -32,12 +33,6 @@ LARGE_BATCH = 1 << 19
 
 SMALL_KAPPA = 0.05
 """Kappa below which its derivative is summed over elements: a difference of two sums would lose digits."""
-
-PIECE = 1 << 17
-"""Elements per piece."""
-
-ROW = 256
-"""Approximate length of a piece's rows, made of repeated channels: operations on short rows take twice as long."""
 
 
 class ReducedLoss(NamedTuple):
@@ -132,9 +127,9 @@ def reduced_loss(
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         table = channel_table(
             xp,
-            _array(xp, raw_kappa),
+            _own_array(xp, raw_kappa),
             _array(xp, settings.fixed_kappa),
-            _array(xp, raw_d),
+            _own_array(xp, raw_d),
             _array(xp, settings.fixed_d),
             ChannelState(*(_array(xp, entry) for entry in settings.state)),
             follows=settings.follows,
@@ -188,6 +183,11 @@ def _array(xp: Any, value: Tensor | None) -> Any:
         return None
     value = value.detach()
     return value.numpy() if xp is np else value
+
+
+def _own_array(xp: Any, value: Tensor | None) -> Any:
+    """A copy for NumPy: memory that NumPy has seen cannot be freed, as sharded trainings do with parameters."""
+    return _array(xp, value.detach().clone() if xp is np and value is not None else value)
 
 
 def _divisor(xp: Any, batch: Elements, settings: LossSettings) -> Any:
@@ -285,26 +285,29 @@ def _in_pieces(
     m = batch.input.shape[-1]
     flat: list[Any] = [None if value is None else value.reshape(-1, m) for value in batch[:4]]
     rows, dtype = len(flat[0]), batch.input.dtype
-    repeats = max(ROW // m, 1)
+    learned = table.kappa_by_raw is not None or table.d_by_raw is not None
+    if not (learned or table.share is not None or batch.weight is not None) and bool((table.kappa > 0).all()):
+        kappa, d = table.kappa.to(dtype), table.d.to(dtype)
+        energy, by_input = fixed_sums(flat[0], flat[1], kappa, d, divisor, wants_input=wants_input)
+        return ChannelSums(None, energy, None, None), None if by_input is None else by_input.view_as(batch.input)
     by_input = torch.empty_like(flat[0]) if wants_input else None
     sums: list[Any] = [None] * 4
-    whole = rows // repeats * repeats
-    for r, start, end in ((repeats, 0, whole), (1, whole, rows)):
-        tiled = ChannelTable(*(None if value is None else value.to(dtype).repeat(r) for value in table))
-        size = max(PIECE // (r * m), 1) * r
-        for first in range(start, end, size):
-            last = min(first + size, end)
-            given: list[Any] = [None if value is None else value[first:last].view(-1, r * m) for value in flat]
-            error = given[0] - given[1]
-            if given[3] is not None:
-                error = torch.where(given[3], error, 0.0)
-            values, slope = _element_values(torch, error, given[2], tiled, divisor, can_read=True)
-            if by_input is not None:
-                by_input[first:last].view(-1, r * m).copy_(slope)
-            for i, value in enumerate(values):
-                if value is not None:
-                    added = value.sum(0).double().view(r, m).sum(0)
-                    sums[i] = added if sums[i] is None else sums[i] + added
+    tiled, tiles = table, 0
+    for first, last, r in pieces(rows, m):
+        if r != tiles:
+            tiled = ChannelTable(*(None if value is None else value.to(dtype).repeat(r) for value in table))
+            tiles = r
+        given: list[Any] = [None if value is None else value[first:last].view(-1, r * m) for value in flat]
+        error = given[0] - given[1]
+        if given[3] is not None:
+            error = torch.where(given[3], error, 0.0)
+        values, slope = _element_values(torch, error, given[2], tiled, divisor, can_read=True)
+        if by_input is not None:
+            by_input[first:last].view(-1, r * m).copy_(slope)
+        for i, value in enumerate(values):
+            if value is not None:
+                added = value.sum(0).double().view(r, m).sum(0)
+                sums[i] = added if sums[i] is None else sums[i] + added
     return ChannelSums(*sums), None if by_input is None else by_input.view_as(batch.input)
 
 

@@ -14,6 +14,7 @@ from mkc_torch._support.arguments import refuse_not_real
 from mkc_torch.density.noise_spread import TailsOverInput, spread_over
 from mkc_torch.density.tails import assess_tails
 from mkc_torch.losses._checks import checked_weight, format_channels
+from mkc_torch.losses.residual_scale import NORMAL_QUANTILE, OTHER_FIT_RATIO, QUANTILE, weighted_quantile
 
 NEAR_FLOOR = 2.0
 """Factor on the floor of d below which a scale is reported as collapsed."""
@@ -29,14 +30,26 @@ def training_warnings(
     """Warnings of :meth:`mkc_torch.MKCLoss.check`."""
     found = []
     d, d_min, bound = loss.d.detach(), loss.d_min, loss.bound
-    low = [int(k) for k in (d < NEAR_FLOOR * d_min).nonzero().flatten()] if loss.raw_d is not None else []
+    has_floor = loss.raw_d is not None or loss._follows
+    low = [int(k) for k in (d < NEAR_FLOOR * d_min).nonzero().flatten()] if has_floor else []
     if low:
         found.append(
             f"The scale d of channel {_listed(low)} is {format_channels(d[low])}, close to its floor "
-            f"{format_channels(d_min[low])}. The network may fit every point, noise included; the likelihood grows "
-            "without limit as d -> 0. Watch a validation set, regularise, or raise `d_min` to the precision of the "
-            "targets."
+            f"{format_channels(d_min[low])}, so outliers smaller than that floor are not found. If the errors on "
+            "validation data are as small, lower `d_min`. If they are larger, the network fits the noise of its "
+            "targets, and the likelihood grows without limit as d -> 0: regularise, or stop earlier."
         )
+    if input is not None and target is not None and loss.residual_scale is not None:
+        residual, share = _residuals(loss, input, target, weight)
+        size = weighted_quantile(torch, residual.abs().T, share.T, QUANTILE) / NORMAL_QUANTILE
+        ratio = torch.where(loss.residual_scale.batches > 0, size / loss.residual_scale.scale, 0.0)
+        wide = [int(k) for k in (ratio > OTHER_FIT_RATIO).nonzero().flatten()]
+        if wide:
+            found.append(
+                f"The errors of channel {_listed(wide)} are {format_channels(ratio[wide])} times as large as those of "
+                "the training. On validation data the network fits the noise of its training targets: regularise, or "
+                "stop earlier. In a new fit the loss is that of another fit: call loss.reset_parameters() before it."
+            )
     if loss._bound_was_given and (input is not None or loss.residual_scale is not None):
         residual, share, _ = _rows(loss, input, target, weight)
         beyond = (share * (residual.abs() > bound)).sum(0) / share.sum(0).clamp(min=torch.finfo(share.dtype).tiny)

@@ -40,7 +40,7 @@ def translate(
         return value if isinstance(value, Tensor) else None
 
     raw, fixed = stored("raw_kappa"), stored("fixed_kappa")
-    if learns_kappa and raw is None and fixed is not None and bool((fixed > 0).all()):
+    if learns_kappa and raw is None and fixed is not None and (fixed.is_meta or bool((fixed > 0).all())):
         state[prefix + "raw_kappa"] = logit_of_kappa(state.pop(prefix + "fixed_kappa"))
     if not learns_kappa and fixed is None and raw is not None:
         state[prefix + "fixed_kappa"] = KAPPA_MAX * torch.sigmoid(state.pop(prefix + "raw_kappa"))

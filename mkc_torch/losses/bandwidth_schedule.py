@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from mkc_torch._support.initial_values import InitialValues, initial_numbers
 from mkc_torch._support.numpy_or_torch import at_least, at_most
 from mkc_torch.density.energy import energy
 from mkc_torch.losses._bandwidth_selection import select_bandwidth
@@ -36,7 +37,7 @@ UNLIMITED = 32.0
 """Bandwidth, in scales, from which it does not limit the likelihood's: half the widest candidate."""
 
 
-class BandwidthSchedule(nn.Module):
+class BandwidthSchedule(InitialValues):
     """Annealing of each channel from the initial loss to Welsch's loss at the selected bandwidth; all state in buffers.
 
     In the first ``warmup_steps`` batches only the initial loss is used. At every fourth batch the bandwidth is
@@ -73,9 +74,10 @@ class BandwidthSchedule(nn.Module):
     ) -> None:
         super().__init__()
         self.warmup_steps, self.anneal_step = warmup_steps, anneal_step
-        self.register_buffer("steps", torch.zeros(num_channels, dtype=torch.int64))
-        self.register_buffer("log_bandwidth", torch.zeros(num_channels))
-        self.register_buffer("share", torch.zeros(num_channels))
+        wide = initial_numbers("share", 0.0).expand(num_channels)
+        self._register("steps", torch.zeros(num_channels, dtype=torch.int64, device="cpu"))
+        self._register("log_bandwidth", wide)
+        self._register("share", wide)
 
     @property
     def bandwidth(self) -> Float[Tensor, " m"]:
@@ -119,7 +121,9 @@ class BandwidthSchedule(nn.Module):
         step = SELECTION_INTERVAL * self.anneal_step * xp.where(selected.better, up, -up)
         annealing = (old.steps >= self.warmup_steps) & ((weight * xp.abs(residual)).sum(-1) > 0)
         due = old.steps % SELECTION_INTERVAL == 0
-        log_bandwidth = old.log_bandwidth + rate * (xp.log(selected.bandwidth) - old.log_bandwidth)
+        known = selected.bandwidth > 0  # no bandwidth is selected where residuals overflow
+        chosen = xp.log(xp.where(known, selected.bandwidth, 1.0))
+        log_bandwidth = xp.where(known, old.log_bandwidth + rate * (chosen - old.log_bandwidth), old.log_bandwidth)
         share = xp.where(annealing, at_most(xp, at_least(xp, old.share + step, 0.0), 1.0), old.share)
         return ScheduleState(
             steps=old.steps + 1,

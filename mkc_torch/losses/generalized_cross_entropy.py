@@ -20,11 +20,11 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import as_numbers, checked_number, checked_whole, refuse_no_tensor, refuse_not_real
+from mkc_torch._support.initial_values import InitialValues, has_values, initial_numbers, is_readable
 from mkc_torch.density.energy import NEAR, relative_series
-from mkc_torch.losses._checks import Reduction, at_least_float32, refuse_other_reduction
+from mkc_torch.losses._checks import Reduction, at_least_float32, format_tensor, refuse_other_reduction
 from mkc_torch.losses._implementation import Implementation, checked_implementation, runs_kernels
 from mkc_torch.losses._label_curves import LabelCurves
-from mkc_torch.losses.heteroscedastic import _WideBuffers
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -36,7 +36,7 @@ _PROBABILITY_SLACK = 0.02
 """Tolerance on the sum of probabilities, which is 1: bfloat16 rounds."""
 
 
-class GeneralizedCrossEntropyLoss(LabelCurves, _WideBuffers):
+class GeneralizedCrossEntropyLoss(LabelCurves, InitialValues):
     """Cross-entropy that is robust to wrong labels: ``σ² (1 - p^(1/σ²))`` with the probability p of the label.
 
     It replaces :class:`torch.nn.CrossEntropyLoss`; at σ = ∞ value and gradient are the same. The default σ = 1.2 is the
@@ -94,8 +94,8 @@ class GeneralizedCrossEntropyLoss(LabelCurves, _WideBuffers):
         self.impl = checked_implementation(impl)
         self.ignore_index = checked_whole("ignore_index", ignore_index, advice="-100 is torch's")
         self.reduction = reduction
-        self.register_buffer("kappa", _inverse_square(sigma))
-        self.register_buffer("weight", None if weight is None else _class_weights(weight))
+        self._register("kappa", _inverse_square(sigma))
+        self._register("weight", None if weight is None else _class_weights(weight))
 
     @property
     def sigma(self) -> Float[Tensor, ""]:
@@ -169,8 +169,9 @@ class GeneralizedCrossEntropyLoss(LabelCurves, _WideBuffers):
         return torch.where(counts, weight, 0.0)
 
     def extra_repr(self) -> str:
-        weighted = "" if self.weight is None else f", weight={self.weight.tolist()}"
-        return f"sigma={self.sigma.item():g}, reduction={self.reduction!r}, ignore_index={self.ignore_index}{weighted}"
+        weighted = "" if self.weight is None else f", weight={format_tensor(self.weight)}"
+        sigma = f"{self.sigma.item():g}" if is_readable(self.sigma) else format_tensor(self.sigma)
+        return f"sigma={sigma}, reduction={self.reduction!r}, ignore_index={self.ignore_index}{weighted}"
 
 
 @functools.cache
@@ -350,11 +351,11 @@ def _inverse_square(sigma: float | Tensor, dtype: torch.dtype | None = None) -> 
             "Expected argument `sigma` without a gradient but got a tensor with requires_grad=True: the loss is "
             "smallest at the smallest sigma, whatever the data. Pass sigma.detach(); graduated_sigma is a schedule."
         )
-    t = as_numbers("sigma", sigma, dtype)
+    t = initial_numbers("sigma", sigma) if dtype is None else as_numbers("sigma", sigma, dtype)
     t = t.to(at_least_float32(t))
     if t.dim() != 0:
         raise ValueError(f"Expected argument `sigma` to be a single number but got shape {tuple(t.shape)}.")
-    if not torch.compiler.is_compiling():
+    if has_values(t) and not torch.compiler.is_compiling():
         try:
             fine = t.item() >= SIGMA_LEAST
         except RuntimeError:  # under vmap values cannot be read
@@ -365,7 +366,7 @@ def _inverse_square(sigma: float | Tensor, dtype: torch.dtype | None = None) -> 
 
 
 def _class_weights(weight: Tensor) -> Tensor:
-    t = as_numbers("weight", weight).detach()
+    t = initial_numbers("weight", weight).detach()
     t = t.to(at_least_float32(t))
     if t.dim() != 1 or t.numel() == 0:
         raise ValueError(f"Expected argument `weight` of shape (C,), one for each class, but got {tuple(t.shape)}.")

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from mkc_torch._support.arguments import as_numbers, checked_whole, first_of, refuse_bad_batch, refuse_not_real
+from mkc_torch._support.arguments import checked_whole, first_of, refuse_bad_batch, refuse_not_real
+from mkc_torch._support.initial_values import InitialValues, has_values, initial_numbers, set_values
 from mkc_torch.density.energy import KAPPA_MAX, energy, inverse_square
 from mkc_torch.density.normalizer import log_partition
 from mkc_torch.losses._checks import (
@@ -17,6 +18,7 @@ from mkc_torch.losses._checks import (
     at_least_float32,
     checked_axis,
     checked_weight,
+    format_tensor,
     refuse_no_dimension,
     refuse_other_reduction,
     refuse_other_shapes,
@@ -38,22 +40,7 @@ _ROUNDING = 1e-5
 """Relative tolerance on the limits of σ and d, for rounding."""
 
 
-class _WideBuffers(nn.Module):
-    """A module whose own buffers stay in float32 at least: half precision would round them, or overflow."""
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> _WideBuffers:
-        def keep(t: Tensor) -> Tensor:
-            out = fn(t)
-            return t.to(out.device) if out.dtype in (torch.float16, torch.bfloat16) else out
-
-        if recurse:
-            for child in self.children():
-                child._apply(fn)
-        super()._apply(keep, recurse=False)  # type: ignore[no-untyped-call]
-        return self
-
-
-class HeteroscedasticMKCLoss(SampleCurves, _WideBuffers):
+class HeteroscedasticMKCLoss(SampleCurves, InitialValues):
     """Negative log-likelihood of the MKC density with a bandwidth σ and a scale d for every element.
 
     The network predicts σ and d together with the location, by :class:`MKCHead` for example. This distinguishes samples
@@ -107,7 +94,7 @@ class HeteroscedasticMKCLoss(SampleCurves, _WideBuffers):
         self.channel_dim = channel_dim
         self.reduction = reduction
         self.impl = checked_implementation(impl)
-        self.register_buffer("bound", _positive("bound", bound))
+        self._register("bound", _positive("bound", bound))
 
     def forward(
         self,
@@ -197,7 +184,7 @@ class HeteroscedasticMKCLoss(SampleCurves, _WideBuffers):
             _refuse_other_shape(name, value, input)
 
     def extra_repr(self) -> str:
-        return f"bound={self.bound.tolist()}, channel_dim={self.channel_dim}, reduction={self.reduction!r}"
+        return f"bound={format_tensor(self.bound)}, channel_dim={self.channel_dim}, reduction={self.reduction!r}"
 
 
 @functools.cache
@@ -213,7 +200,7 @@ class MKCHeadOutput(NamedTuple):
     d: Float[Tensor, "*batch m"]
 
 
-class MKCHead(_WideBuffers):
+class MKCHead(InitialValues):
     """Output layer of a network: the prediction, σ and d of each of m channels.
 
     A sigmoid of a linear function of the features keeps ``1 / sigma²`` in [1e-6, 400], that is σ in [0.05, 1000], and d
@@ -266,15 +253,16 @@ class MKCHead(_WideBuffers):
         num_channels = checked_whole("num_channels", num_channels, 1)
         given = {"bound": bound, "d_min": d_min, "sigma_init": sigma_init, "d_init": d_init}
         values = {name: _positive(name, value, num_channels) for name, value in given.items()}
-        self.register_buffer("bound", values["bound"])
-        self.register_buffer("d_min", values["d_min"])
-        if not bool(((values["d_min"] < values["d_init"]) & (values["d_init"] < values["bound"])).all()):
+        self._register("bound", values["bound"])
+        self._register("d_min", values["d_min"])
+        known = has_values(*values.values())
+        if known and not bool(((values["d_min"] < values["d_init"]) & (values["d_init"] < values["bound"])).all()):
             raise ValueError(
-                f"Expected argument `d_init` between `d_min` {self.d_min.tolist()} and `bound` {self.bound.tolist()} "
-                f"but got {d_init}; a robust scale of the targets is a good start."
+                f"Expected argument `d_init` between `d_min` {format_tensor(values['d_min'])} and `bound` "
+                f"{format_tensor(values['bound'])} but got {d_init}; a robust scale of the targets is a good start."
             )
         kappa = inverse_square(values["sigma_init"].double())
-        if not bool(((kappa > KAPPA_MIN) & (kappa < KAPPA_MAX)).all()):
+        if known and not bool(((kappa > KAPPA_MIN) & (kappa < KAPPA_MAX)).all()):
             raise ValueError(
                 f"Expected argument `sigma_init` in ({KAPPA_MAX**-0.5:g}, {KAPPA_MIN**-0.5:g}) but got {sigma_init}; "
                 "start at 10 for noise that is nearly Gaussian."
@@ -282,14 +270,17 @@ class MKCHead(_WideBuffers):
         self.in_features = in_features
         self.num_channels = num_channels
         self.location = nn.Linear(in_features, num_channels)
-        self.scales = nn.Linear(in_features, 2 * num_channels)
-        low, high = self.d_min.double(), self.bound.double()
-        start = torch.logit(
-            torch.cat([(kappa - KAPPA_MIN) / (KAPPA_MAX - KAPPA_MIN), (values["d_init"].double() - low) / (high - low)])
+        low, high = values["d_min"].double(), values["bound"].double()
+        d = (values["d_init"].double() - low) / (high - low)
+        self.scales = _ConstantStart(
+            in_features, torch.logit(torch.cat([(kappa - KAPPA_MIN) / (KAPPA_MAX - KAPPA_MIN), d]))
         )
-        with torch.no_grad():
-            self.scales.weight.zero_()
-            self.scales.bias.copy_(start)
+
+    def reset_parameters(self) -> None:
+        """Set both layers, ``bound`` and ``d_min`` to their initial values; the predictions' weights are random."""
+        super().reset_parameters()
+        self.location.reset_parameters()
+        self.scales.reset_parameters()
 
     def forward(self, features: Float[Tensor, "*batch n"]) -> MKCHeadOutput:
         """Predictions, σ and d of each sample.
@@ -320,7 +311,26 @@ class MKCHead(_WideBuffers):
         return MKCHeadOutput(location, sigma, d)
 
     def extra_repr(self) -> str:
-        return f"{self.in_features}, {self.num_channels}, bound={self.bound.tolist()}, d_min={self.d_min.tolist()}"
+        bound, d_min = format_tensor(self.bound), format_tensor(self.d_min)
+        return f"{self.in_features}, {self.num_channels}, bound={bound}, d_min={d_min}"
+
+
+class _ConstantStart(nn.Linear):
+    """A linear layer that starts as the same outputs for every sample."""
+
+    def __init__(self, in_features: int, start: Float[Tensor, " k"]) -> None:
+        super().__init__(in_features, len(start))
+        self._start = start
+        self.reset_parameters()
+
+    @torch.no_grad()
+    def reset_parameters(self) -> None:
+        start = self.__dict__.get("_start")
+        if start is None:  # nn.Linear calls this before there is a start
+            super().reset_parameters()
+            return
+        self.weight.zero_()
+        set_values("bias", self.bias, start)
 
 
 class MKCConvHead(MKCHead):
@@ -357,12 +367,12 @@ class MKCConvHead(MKCHead):
 
 def _positive(name: str, value: float | Tensor, num_channels: int | None = None) -> Tensor:
     """A positive number or a value per channel as a tensor, expanded to (m,) if m is given."""
-    t = as_numbers(name, value).detach()
+    t = initial_numbers(name, value).detach()
     t = t.to(at_least_float32(t))
     if t.dim() > 1 or (num_channels is not None and t.dim() == 1 and t.shape[0] not in (1, num_channels)):
         wanted = "(m,)" if num_channels is None else f"({num_channels},)"
         raise ValueError(f"Expected argument `{name}` to be a number or of shape {wanted} but got {tuple(t.shape)}.")
-    if not bool(((t > 0) & torch.isfinite(t)).all()):
+    if has_values(t) and not bool(((t > 0) & torch.isfinite(t)).all()):
         raise ValueError(f"Expected argument `{name}` to be positive and finite but got {value}.")
     return t.clone() if num_channels is None else t.expand(num_channels).clone()
 

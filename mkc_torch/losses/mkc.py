@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from mkc_torch._support.arguments import format_value, refuse_bad_batch
+from mkc_torch._support.initial_values import is_readable
 from mkc_torch._support.torch_internals import in_backward, is_transformed
 from mkc_torch.losses._channel_density import ChannelDensity, Objective, is_auto
 from mkc_torch.losses._checks import (
@@ -17,6 +18,7 @@ from mkc_torch.losses._checks import (
     checked_axis,
     checked_weight,
     format_channels,
+    format_tensor,
     refuse_no_dimension,
     refuse_other_reduction,
     refuse_other_shapes,
@@ -70,7 +72,7 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         channel_dim: the dimension of the input that holds the channels, 1 for (N, C, H, W); None for the last. An input
             of four dimensions or more whose second and last dimension both have size m needs an explicit value.
         reduction: "none", "mean" (over elements, weighted if weights are given) or "sum".
-        d_min: floor of d, a number or (m,); None means a thousandth of the initial d, or of the spread of the first
+        d_min: floor of d, a number or (m,); None means a thousandth of the initial d, or of the running scale of the
             residuals. The likelihood of a network that interpolates its targets grows without limit as d → 0.
         impl: "auto" runs Triton kernels on a GPU that has them and torch elsewhere; "eager", "compile" or "triton"
             select an implementation. All give the same results.
@@ -169,7 +171,8 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         """The loss of predictions against targets.
 
         Args:
-            input: predictions, any shape whose ``channel_dim`` has size m.
+            input: predictions, any shape whose ``channel_dim`` has size m; (m,) is a single sample of m channels. Give
+                N samples of one channel the shape (N, 1), and the loss ``num_channels=1``.
             target: targets of the same shape; nothing is broadcast.
             weight: non-negative weights, or a boolean mask (True: used); of the shape of the input, with size 1 along
                 dimensions in which it is constant, or without the channel dimension. Elements of weight 0 or False, NaN
@@ -187,6 +190,12 @@ class MKCLoss(ChannelCurves, ChannelDensity):
                 NaN prediction in float16, so that a gradient scaler sees an overflow. The running scale ignores
                 residuals that are not finite.
         """
+        value = self._value(input, target, weight)
+        if not torch.compiler.is_compiling() and not self._watch.is_done:
+            self._watch.after_forward(self, value)
+        return value
+
+    def _value(self, input: Tensor, target: Tensor, weight: Tensor | None) -> Tensor:
         if runs_kernels(self, input):
             from mkc_torch.losses.kernels.entry import kernel_loss
 
@@ -242,8 +251,9 @@ class MKCLoss(ChannelCurves, ChannelDensity):
     ) -> tuple[str, ...]:
         """Warnings about a training, a sentence each; empty if there are none. Waits for the device.
 
-        The checks: a d close to its floor; more than 1 % of the errors beyond a given bound; σ or d missing from the
-        optimizer; SGD with the robust objective, whose gradient grows as the residuals shrink and should be clipped.
+        The checks: a d close to its floor; errors several times as large as those of the training; more than 1 % of the
+        errors beyond a given bound; σ or d missing from the optimizer; SGD with the robust objective, whose gradient
+        grows as the residuals shrink and should be clipped.
 
         Args:
             input, target, weight: as in :meth:`forward`; None for the most recent residuals, if the loss keeps them.
@@ -319,7 +329,9 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         # function transforms have no state; activation checkpointing repeats the forward pass during the backward pass
         if not torch.compiler.is_compiling() and (in_backward() or any(map(is_transformed, self._tensors(batch)))):
             return False
-        scale.update(batch.input, batch.target, batch.weight, batch.axis)
+        growth = scale.update(batch.input, batch.target, batch.weight, batch.axis)
+        if growth is not None:
+            self._watch.warn_of_other_fit(growth)
         if schedule is not None:
             schedule.update(scale)
         return True
@@ -345,6 +357,9 @@ class MKCLoss(ChannelCurves, ChannelDensity):
 
     def __repr__(self) -> str:
         learned = [n for n, p in (("sigma", self.raw_kappa), ("d", self.raw_d)) if p is not None]
+        unread = [format_tensor(p) for p in (self.raw_kappa, self.raw_d) if p is not None and not is_readable(p)]
+        if unread:
+            return f"MKCLoss({self.num_channels}, {unread[0]}, learns={learned})"
         with torch.no_grad():
             sigma, d, bound = (format_channels(values) for values in (self.sigma, self.d, self.bound))
         if self._follows:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -10,6 +11,7 @@ import torch
 import torch.distributed
 from torch import Tensor, nn
 
+from mkc_torch._support.initial_values import InitialValues, initial_numbers
 from mkc_torch._support.numpy_or_torch import at_least
 from mkc_torch._support.torch_internals import is_wrapped
 
@@ -43,8 +45,18 @@ RANGE_DECAY = 0.999
 SCALES_IN_BOUND = 10.0
 """Smallest bound, in scales."""
 
-FLOOR_IN_SPREAD = 1e-3
-"""Floor of d, as a share of the mean absolute deviation of the first residuals."""
+FLOOR_IN_SCALE = 1e-3
+"""Floor of d, in scales: it follows the scale, because a network may learn targets to any share of their spread."""
+
+OTHER_FIT_RATIO = 6.0
+"""Growth of the residuals from which they seem to be those of another fit: noise-free fits at a large learning rate
+reach 5.8."""
+
+GROWING_RATIO = 1.1
+"""Ratio of the recent residuals' scale to the running scale below which residuals are not examined for growth."""
+
+SETTLED_BATCHES = 100
+"""Batches that form a state: before, the residuals of a single fit may grow."""
 
 TINY = 1e-30
 """Lower limit of logarithms' arguments and of denominators."""
@@ -53,7 +65,7 @@ SMALL_STATE = 64
 """Channels up to which NumPy computes the state on the CPU: its overhead per call is smaller than torch's."""
 
 
-class ResidualScale(nn.Module):
+class ResidualScale(InitialValues):
     """Running robust scale, half range and most recent residuals of each channel, all in buffers.
 
     ``update`` is the only method that changes the state; it is called in training. The scale is the 0.4 quantile of
@@ -73,7 +85,6 @@ class ResidualScale(nn.Module):
         batches: number of batches with at least one finite residual of positive weight, (m,).
         log_scale: logarithm of the scale in the unit of the target, (m,).
         half_range: half the range of the residuals, (m,).
-        floor: a thousandth of the spread of the first residuals, (m,).
 
     Example:
         >>> scale = ResidualScale(1)
@@ -87,17 +98,17 @@ class ResidualScale(nn.Module):
     batches: Tensor
     log_scale: Tensor
     half_range: Tensor
-    floor: Tensor
 
     def __init__(self, num_channels: int) -> None:
         super().__init__()
         length = min(MOST_RECENT, max(FEWEST_RECENT, RECENT_IN_ALL // num_channels))
-        self.register_buffer("recent", torch.zeros(3, num_channels, length))
-        self.register_buffer("position", torch.zeros(num_channels, dtype=torch.int64))
-        self.register_buffer("batches", torch.zeros(num_channels, dtype=torch.int64))
-        self.register_buffer("log_scale", torch.zeros(num_channels))
-        self.register_buffer("half_range", torch.ones(num_channels))
-        self.register_buffer("floor", torch.full((num_channels,), FLOOR_IN_SPREAD))
+        wide = initial_numbers("scale", 0.0).expand(num_channels)
+        counter = torch.zeros(num_channels, dtype=torch.int64, device="cpu")
+        self._register("recent", wide.new_zeros(3, num_channels, length))
+        self._register("position", counter)
+        self._register("batches", counter)
+        self._register("log_scale", wide)
+        self._register("half_range", wide + 1.0)
 
     @property
     def scale(self) -> Float[Tensor, " m"]:
@@ -109,6 +120,11 @@ class ResidualScale(nn.Module):
         """Half the range of the residuals, and at least ten scales, in the unit of the target."""
         return torch.maximum(self.half_range, SCALES_IN_BOUND * self.scale)
 
+    @property
+    def floor(self) -> Float[Tensor, " m"]:
+        """Smallest d, a thousandth of the scale, in the unit of the target."""
+        return FLOOR_IN_SCALE * self.scale
+
     @torch.no_grad()
     def update(
         self,
@@ -116,7 +132,7 @@ class ResidualScale(nn.Module):
         target: Float[Tensor, "*shape"],
         weight: Float[Tensor, "*shape"] | Bool[Tensor, "*shape"] | None = None,
         channel_dim: int = -1,
-    ) -> None:
+    ) -> float | None:
         """Update the state by a batch.
 
         Args:
@@ -124,14 +140,24 @@ class ResidualScale(nn.Module):
             target: targets of the same shape.
             weight: non-negative weights or a mask of the same shape; None for 1.
             channel_dim: the dimension of the channels.
+
+        Returns:
+            How many times larger the residuals have become since the state was formed, if that is more than
+            ``OTHER_FIT_RATIO``; else None. It is computed only where NumPy computes the state.
         """
+        growth = None
         rows, spread = self._sampled(prediction, target, weight, channel_dim)
         if len(self.log_scale) <= SMALL_STATE and numpy_may_read(self.log_scale, *rows):
             recent, state = self.recent.numpy(), ScaleState(*(value.numpy() for value in self._state()))
             with np.errstate(over="ignore", invalid="ignore"):
                 batch = rows_of_batch(np, recent.dtype, _arrays(rows), None if spread is None else _arrays(spread))
                 _insert_in_numpy(recent, self.position, batch.rows)
-                state = updated(np, recent, state, batch)
+                state, old = updated(np, recent, state, batch), state
+                growth = residual_growth(recent, self.position, old, state)
+            if not is_distributed():
+                for own, value in zip(old, state, strict=True):
+                    own[...] = value
+                return growth
             state = ScaleState(*(torch.from_numpy(value) for value in state))
         else:
             batch = rows_of_batch(torch, self.recent.dtype, rows, spread)
@@ -142,6 +168,7 @@ class ResidualScale(nn.Module):
             state = updated(torch, self.recent, self._state(), batch)
         for old, new in zip(self._state(), synchronized_state(state), strict=True):
             old.copy_(new)
+        return growth
 
     def _sampled(
         self, prediction: Tensor, target: Tensor, weight: Tensor | None, axis: int
@@ -154,8 +181,12 @@ class ResidualScale(nn.Module):
             return rows, None
         return rows, [spaced_rows(values, axis, RANGE_ROWS) for values in given]
 
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        state_dict.pop(prefix + "floor", None)  # earlier states hold it; the scale determines it
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
     def _state(self) -> ScaleState:
-        return ScaleState(self.batches, self.log_scale, self.half_range, self.floor)
+        return ScaleState(self.batches, self.log_scale, self.half_range)
 
     @torch.no_grad()
     def with_batch(self, prediction: Tensor, target: Tensor, weight: Tensor | None, channel_dim: int) -> ScaleState:
@@ -172,7 +203,6 @@ class ScaleState(NamedTuple):
     batches: Any
     log_scale: Any
     half_range: Any
-    floor: Any
 
 
 class BatchRows(NamedTuple):
@@ -191,17 +221,21 @@ def rows_of_batch(xp: Any, dtype: Any, rows: Sequence[Any], more: Sequence[Any] 
         rows: predictions, targets and, if any, weights, (k, m) each.
         more: the same of more rows, for the half range; None takes ``rows``.
     """
-    residual, prediction, weight = _residuals(xp, dtype, *rows)
-    wide, _, counts = (residual, prediction, weight) if more is None else _residuals(xp, dtype, *more)
-    least, most = (xp.where(counts > 0, wide, bound) for bound in (np.inf, -np.inf))
-    half_range = at_least(xp, 0.5 * (xp.amax(most, 0) - xp.amin(least, 0)), 0.0)  # 0 where all weights are 0
-    return BatchRows(xp.stack([residual.T, prediction.T, weight.T]), half_range)
+    stacked = xp.stack([value.T for value in _residuals(xp, dtype, *rows)])
+    wide, _, counts = stacked if more is None else (value.T for value in _residuals(xp, dtype, *more))
+    least = most = wide
+    if xp is not np or not counts.all():  # only NumPy may branch on a value
+        least, most = (xp.where(counts > 0, wide, bound) for bound in (np.inf, -np.inf))
+    half_range = at_least(xp, 0.5 * xp.amax(most, -1) - 0.5 * xp.amin(least, -1), 0.0)  # 0 where all weights are 0
+    return BatchRows(stacked, half_range)
 
 
 def _residuals(xp: Any, dtype: Any, prediction: Any, target: Any, weight: Any = None) -> tuple[Any, Any, Any]:
     prediction, target = _cast(xp, prediction, dtype), _cast(xp, target, dtype)
     residual = prediction - target
     counts = xp.isfinite(residual)
+    if xp is np and weight is None and counts.all():
+        return residual, prediction, np.ones_like(residual)
     if weight is None:
         weight = _cast(xp, counts, dtype)
     else:
@@ -238,35 +272,56 @@ def updated(xp: Any, recent: Any, old: ScaleState, batch: BatchRows) -> ScaleSta
     """
     residual, weight = recent[0], recent[2]
     size = xp.abs(residual)
-    share = weight / at_least(xp, weight.sum(-1), TINY)[..., None]
     candidate = weighted_quantile(xp, size, weight, QUANTILE) / NORMAL_QUANTILE
-    # if most residuals are exactly 0, the mean absolute residual replaces the quantile
-    candidate = xp.where(candidate > 0, candidate, (size * share).sum(-1))
-    known = (candidate > 0) & (batch.rows[2].sum(-1) > 0)
+    if xp is not np or not (candidate > 0).all():
+        # if most residuals are exactly 0, the mean absolute residual replaces the quantile
+        share = weight / at_least(xp, weight.sum(-1), TINY)[..., None]
+        candidate = xp.where(candidate > 0, candidate, (size * share).sum(-1))
+    known = (candidate > 0) & (candidate < xp.inf) & (batch.rows[2].sum(-1) > 0)
     first = (old.batches == 0) & known
     new = xp.where(known, xp.log(at_least(xp, candidate, TINY)), old.log_scale)
     rate = at_least(xp, 1.0 / (_cast(xp, old.batches, recent.dtype) + 1.0), RATE)
     log_scale = xp.where(first, new, old.log_scale + rate * (new - old.log_scale))
-    floor = old.floor
-    if xp is not np or first.any():  # only NumPy may branch on a value
-        middle = (residual * share).sum(-1)
-        spread = (xp.abs(residual - middle[..., None]) * share).sum(-1)
-        scale = xp.exp(log_scale)
-        # an offset widens the scale; far outliers widen the spread: take the smaller
-        own = FLOOR_IN_SPREAD * xp.where(spread > 0, xp.minimum(spread, scale), scale)
-        floor = xp.where(first, own, old.floor)
     wider = xp.maximum(batch.half_range, RANGE_DECAY * old.half_range)
     return ScaleState(
         batches=old.batches + known,
         log_scale=log_scale,
         half_range=xp.where(first, batch.half_range, xp.where(known, wider, old.half_range)),
-        floor=floor,
     )
+
+
+def residual_growth(recent: Any, position: Tensor, old: ScaleState, new: ScaleState) -> float | None:
+    """How many times larger the residuals have become; None up to ``OTHER_FIT_RATIO``, or if the state is young.
+
+    A large batch replaces all recent residuals, and its scale is compared with the running scale. The running scale
+    follows small batches; then the newest quarter of the recent residuals is compared with their oldest half.
+
+    Args:
+        recent: the buffer of :class:`ResidualScale` with this batch, an array of NumPy.
+        position: index that the next residual takes, equal for all channels.
+        old, new: the state before and after this batch.
+    """
+    change = new.log_scale - old.log_scale
+    if not change.max() > RATE * math.log(GROWING_RATIO):
+        return None
+    growing = (old.batches >= SETTLED_BATCHES) & (change > RATE * math.log(GROWING_RATIO))
+    if not growing.any():
+        return None
+    length = recent.shape[-1]
+    ordered = recent[:, :, (int(position[0]) + np.arange(length)) % length]
+    parts = (ordered[..., -(length // 4) :], ordered[..., : length // 2])
+    newest, oldest = (weighted_quantile(np, np.abs(part[0]), part[2], QUANTILE) for part in parts)
+    ratio = np.maximum(np.exp(change / RATE), newest / at_least(np, oldest, TINY))
+    largest = float(np.where(growing & (oldest > 0), ratio, 0.0).max())
+    return largest if largest > OTHER_FIT_RATIO else None
 
 
 def weighted_quantile(xp: Any, values: Any, weight: Any, level: float) -> Any:
     """Weighted quantile of each channel: the smallest value up to which a share ``level`` of the weight lies, (m,)."""
     if xp is np:
+        if weight.min() == 1.0 == weight.max():
+            rank = min(max(math.ceil(level * values.shape[-1]) - 1, 0), values.shape[-1] - 1)
+            return np.partition(values, rank, -1)[..., rank]
         equal = weight == (weight > 0)
         if equal.all():  # sorting values alone is several times as fast as sorting weights with them
             ordered = np.sort(np.where(weight > 0, values, np.inf), -1)
@@ -332,12 +387,9 @@ def synchronized_state(state: ScaleState) -> ScaleState:
     if not is_distributed():
         return state
     known = (state.batches > 0).to(state.log_scale)
-    share, *shares = average_over_processes([known, known * state.log_scale, known * state.floor])
-    log_scale, floor = (
-        torch.where(share > 0, mean / share.clamp(min=TINY), old)
-        for mean, old in zip(shares, (state.log_scale, state.floor), strict=True)
-    )
+    share, mean = average_over_processes([known, known * state.log_scale])
+    log_scale = torch.where(share > 0, mean / share.clamp(min=TINY), state.log_scale)
     widest = torch.stack([known * state.half_range, state.batches.to(state.half_range)])
     torch.distributed.all_reduce(widest, torch.distributed.ReduceOp.MAX)
     half_range = torch.where(share > 0, widest[0], state.half_range)
-    return ScaleState(widest[1].to(state.batches), log_scale, half_range, floor)
+    return ScaleState(widest[1].to(state.batches), log_scale, half_range)

@@ -757,7 +757,7 @@ def test_a_narrow_bound_falls_back_to_least_squares(kind):
 @each_kind
 def test_a_network_that_interpolates_warns_once(kind):
     module = Replay(growth=0.3, **kind)
-    with pytest.warns(UserWarning, match=r"collapses in channel .*validation set.*weight decay.*d_min") as record:
+    with pytest.warns(UserWarning, match=r"collapses in channel .*validation set.*d_min.*weight decay") as record:
         trained(module, loader(residual_draws(300, 2)), max_epochs=9)
     assert sorted(c for text in warnings_of(record) for c in text.partition(":")[0] if c.isdigit()) == ["0", "1"]
     assert (module.criterion.d >= module.criterion.d_min).all()
@@ -1064,8 +1064,38 @@ def test_a_default_loss_trains_a_network_for_any_sigma_and_d():
     y = 1000.0 * (x @ torch.tensor([[1.0], [-2.0], [0.5]])) + 10.0 * torch.randn(400, 1)
     y[::5] += 1e5
     module = Regression(lr=30.0, sigma=3.0, d="auto", bound="auto", learn_sigma=True, learn_d=True)
-    trainer_of(max_epochs=60).fit(module, loader(x, y))
+    with pytest.warns(UserWarning, match="the optimizer does not have them"):
+        trainer_of(max_epochs=60).fit(module, loader(x, y))
     torch.testing.assert_close(module.net.weight[0].detach(), torch.tensor([1e3, -2e3, 500.0]), rtol=0.05, atol=0.0)
+
+
+@pytest.mark.parametrize("options", [FIXED, LEARNED, {**FIXED, "d": "auto", "bound": "auto"}, {"d": "auto", **LEARNED}])
+def test_a_module_that_is_fitted_again_starts_like_a_new_loss(options):
+    torch.manual_seed(0)
+    x = torch.randn(400, 3)
+    y = x @ torch.tensor([[1.0], [-2.0], [0.5]]) + 0.1 * torch.randn(400, 1)
+    module, expected = Regression(**options), Regression(**options)
+    for fitted, fits in ((module, 2), (expected, 1)):
+        for _ in range(fits):
+            fitted.net.load_state_dict(Regression().net.state_dict())
+            trained(fitted, loader(x, y, shuffle=False), max_epochs=4)
+    for name, value in expected.state_dict().items():
+        torch.testing.assert_close(module.state_dict()[name], value, rtol=0.0, atol=0.0, msg=name)
+
+
+@pytest.mark.filterwarnings("ignore:The d of the loss `criterion` collapses")
+@each_kind
+def test_d_follows_residuals_that_shrink(kind):
+    error = torch.randn(800, 2, generator=torch.Generator().manual_seed(0))
+    module, _ = trained(Replay(d="auto", bound="auto", growth=0.02, **kind), loader(error), max_epochs=4)
+    torch.testing.assert_close(module.criterion.d, torch.full((2,), 0.02**3), rtol=0.1, atol=0.0)
+
+
+def test_a_floor_that_was_given_stays():
+    module = Replay(d="auto", bound="auto", d_min=0.01, growth=1e-2)
+    with pytest.warns(UserWarning, match=r"reached its floor.*If they are as small, lower a given `d_min`"):
+        trained(module, loader(residual_draws(800, 2)), max_epochs=4)
+    torch.testing.assert_close(module.criterion.d, torch.full((2,), 0.01))
 
 
 TRUTH = torch.tensor([[1.0], [-2.0], [0.5]])

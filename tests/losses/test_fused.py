@@ -5,7 +5,9 @@ import math
 import pytest
 import torch
 
+from mkc_torch.losses import _fixed_pieces
 from mkc_torch.losses import _fused as module
+from mkc_torch.losses._fixed_pieces import fixed_sums
 from mkc_torch.losses._fused import LARGE_BATCH, SMALL_BATCH, fused_loss
 from mkc_torch.losses._parameters import ChannelState
 from mkc_torch.losses._terms import Batch, LossSettings, loss_value
@@ -83,8 +85,8 @@ def implementation(request, monkeypatch):
         monkeypatch.setattr(module, "SMALL_STATE", 0)
     if request.param == "pieces":
         monkeypatch.setattr(module, "LARGE_BATCH", 1)
-        monkeypatch.setattr(module, "PIECE", 24)
-        monkeypatch.setattr(module, "ROW", 8)
+        monkeypatch.setattr(_fixed_pieces, "PIECE", 24)
+        monkeypatch.setattr(_fixed_pieces, "ROW", 8)
     return request.param
 
 
@@ -362,3 +364,21 @@ def test_second_derivatives_equal_the_formulas(mode):
         mixed = sum((slope * (1.0 + slope)).sum() for slope in slopes)
         found.append([value, *slopes, *torch.autograd.grad(mixed, wanted)])
     torch.testing.assert_close(*found, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1e-4, 0.1, 1.0, 30.0, 1e15])
+@pytest.mark.parametrize("unit", [1.0, 1e-15, 1e20])
+@pytest.mark.parametrize("equal", [False, True])
+def test_sums_of_a_large_batch_of_given_numbers_keep_single_precision(size, equal, unit, monkeypatch):
+    """Also where all energies are small, where they are at their limit, and where all rounding errors are equal."""
+    monkeypatch.setattr(_fixed_pieces, "PIECE", 1 << 12)
+    kappa, d = torch.tensor([0.01, 0.1, 1.0, 4.0]), unit * torch.tensor([0.5, 1.0, 2.0, 0.1])
+    error = unit * size * (torch.ones(9_999, 4) if equal else randn(9_999, 4, dtype=torch.float32))
+    energy, slope = fixed_sums(error, torch.zeros_like(error), kappa, d, 4e4, wants_input=True)
+    without = fixed_sums(error, torch.zeros_like(error), kappa, d, 4e4, wants_input=False)
+    minus_x = -0.5 * kappa.double() * (error.double() / d.double()).square()
+    torch.testing.assert_close(energy, (-torch.expm1(minus_x) / kappa.double()).sum(0), rtol=2e-6, atol=0.0)
+    expected = error.double() / d.double().square() * minus_x.exp() / 4e4
+    torch.testing.assert_close(slope.double() * unit, expected * unit, rtol=2e-5, atol=1e-17)
+    assert without[1] is None
+    torch.testing.assert_close(without[0], energy, rtol=0.0, atol=0.0)

@@ -183,6 +183,7 @@ def test_torch_equals_numpy_over_300_batches(options, monkeypatch):
     assert_same_steps(loss, other, other, 300, rtol=1e-10, prepare=choose)
 
 
+@pytest.mark.filterwarnings("ignore:In 100 training steps")  # nothing is optimised
 def test_torch_equals_numpy_in_single_precision(monkeypatch):
     loss = make_loss({}).float()
     other = copy.deepcopy(loss)

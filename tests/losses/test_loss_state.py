@@ -462,7 +462,6 @@ def test_processes_share_the_geometric_mean_scale_and_the_widest_range(
     scale = 0.4 / 0.5244005
     assert torch.tensor(left["log_scale"]).exp().tolist() == pytest.approx([2.0 * scale, 4.0 * scale, 1.0], rel=1e-2)
     assert left["half_range"] == pytest.approx([4.0, 4.0, 1.0])
-    assert left["floor"] == pytest.approx([1.25e-3, 2e-3, 1e-3], rel=2e-2)
     assert left["batches"] == [1, 1, 0]
 
 
@@ -488,3 +487,33 @@ def test_sigma_and_d_are_averaged_only_if_the_loss_is_inside_the_wrapped_module(
         assert outside[0] != outside[1]
     for place in ("network", "network outside"):
         assert processes[0][f"{kind}, {place}"] == processes[1][f"{kind}, {place}"]
+
+
+# --- the ends of the range of numbers
+
+HUGE = {torch.float32: (1e20, 3e38, 1e-42), torch.float64: (1e160, 1e308, 1e-310)}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("options", [*ROBUST.values(), {"objective": "likelihood"}, {"d": 1.0}, {"d": 1.0, **FIXED}])
+@pytest.mark.parametrize(("dtype", "size"), [(dtype, size) for dtype, sizes in HUGE.items() for size in sizes])
+def test_predictions_at_the_ends_of_the_range_warn_of_nothing_and_leave_a_finite_state(dtype, size, options):
+    loss, target = MKCLoss(1, **options).to(dtype), torch.zeros(50, 1, dtype=dtype)
+    signs = torch.ones(50, 1, dtype=dtype)
+    signs[::3] = -1.0
+    for step, scale in enumerate([size, 1.0, 1.0, 1.0, size, 1.0]):
+        loss((scale * (signs if step % 2 else signs.abs())).requires_grad_(), target).backward()
+    for value in (*loss.state_dict().values(), loss.sigma, loss.d, loss.bound):
+        assert value.isfinite().all()
+    leaf = signs.clone().requires_grad_()
+    loss(leaf, target).backward()
+    assert leaf.grad.isfinite().all()
+
+
+def test_a_vector_of_m_numbers_is_a_sample_of_m_channels():
+    loss, other = MKCLoss(3), MKCLoss(3)
+    x, y = data(1, 3)
+    assert loss(x[0], y[0]).item() == pytest.approx(other(x, y).item())
+    assert_same(state(loss), state(other))
+    with pytest.raises(ValueError, match=r"Expected 1 channel.*unsqueeze\(-1\)"):
+        MKCLoss(1)(x[0], y[0])

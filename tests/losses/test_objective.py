@@ -345,7 +345,7 @@ def test_d_cannot_be_set_while_it_follows_the_residuals():
 
 
 def test_a_loss_frozen_at_its_floor_can_still_learn():
-    loss = MKCLoss(1)
+    loss = MKCLoss(1, d_min=1e-3)
     noise = torch.randn(50, 1, generator=generator())
     for size in [1.0, *[1e-9] * 50]:
         loss((size * noise).requires_grad_(), torch.zeros(50, 1))

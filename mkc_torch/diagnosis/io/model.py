@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from mkc_torch._support.initial_values import InitialParameters
 from mkc_torch.diagnosis.declared import checked_input_hold
 from mkc_torch.diagnosis.io.mjcf import Part, mjcf_changes, mjcf_source
 from mkc_torch.diagnosis.io.python_source import SourceError, python_source
@@ -85,8 +86,8 @@ class DiagnosedModel(CorrectingModel):
         super().__init__()
         self.simulation = simulation
         self.state = dict(state)
-        self.theta = nn.Parameter(parameters.detach().clone(), requires_grad=False)
-        self.gammas = nn.ParameterList(nn.Parameter(g.detach().clone(), requires_grad=False) for g in gammas)
+        self._register("theta", parameters, learned=False)
+        self.gammas = InitialParameters(gammas)
         self.terms = tuple(terms)
         self.source = source
         self.reference = reference

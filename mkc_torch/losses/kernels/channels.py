@@ -86,7 +86,7 @@ def risk_of(influence, slope, share, step_of_initial, standardised, size):
 @triton.jit
 def channel_kernel(
     x, t, w,
-    recent, position, batches, log_scale, half_range, floor,
+    recent, position, batches, log_scale, half_range,
     steps, log_bandwidth, share,
     kappa_given, d_given, bound_given, floor_given,
     table, rule, widths,
@@ -151,30 +151,24 @@ def channel_kernel(
             )
             low = tl.where(counted > 0, tl.minimum(low, value), low)
             high = tl.where(counted > 0, tl.maximum(high, value), high)
-        span = tl.maximum(0.5 * (tl.max(high, 0) - tl.min(low, 0)), 0.0)
+        span = tl.maximum(0.5 * tl.max(high, 0) - 0.5 * tl.min(low, 0), 0.0)
         size = tl.abs(residual)
         part = weight / tl.maximum(tl.sum(weight, 0), 1e-30)
         candidate = quantile(size, weight, 0.4, WIDE) / 0.5244005
         candidate = tl.where(candidate > 0, candidate, tl.sum(size * part, 0))
-        known = (candidate > 0) & (given > 0)
+        known = (candidate > 0) & (candidate < float("inf")) & (given > 0)
         seen, old = tl.load(batches + channel), tl.load(log_scale + channel).to(like)
         begins = known & (seen == 0)
         found = tl.where(known, tl.log(tl.maximum(candidate, 1e-30)), old)
         rate = tl.maximum(1.0 / (seen.to(like) + 1.0), 0.1)
         own = tl.where(begins, found, old + rate * (found - old))
-        middle = tl.sum(residual * part, 0)
-        spread = tl.sum(tl.abs(residual - middle) * part, 0)
-        scale = tl.exp(own)
-        least = 1e-3 * tl.where(spread > 0, tl.minimum(spread, scale), scale)
         old_range = tl.load(half_range + channel).to(like)
         wider = tl.maximum(span, 0.999 * old_range)
         wider = tl.where(begins, span, tl.where(known, wider, old_range))
-        least = tl.where(begins, least, tl.load(floor + channel).to(like))
         if SCALE:
             tl.store(batches + channel, seen + known.to(tl.int64))
             tl.store(log_scale + channel, own)
             tl.store(half_range + channel, wider)
-            tl.store(floor + channel, least)
         else:
             own, wider = tl.where(seen == 0, own, old), tl.where(seen == 0, wider, old_range)
     if SCHEDULE:
@@ -212,7 +206,8 @@ def channel_kernel(
             counted = step_count.to(like)
             pace = tl.minimum(tl.maximum(4.0 / (counted + 1.0), 0.3439), 1.0)
             old_width = tl.load(log_bandwidth + channel).to(like)
-            tl.store(log_bandwidth + channel, old_width + pace * (tl.log(chosen) - old_width))
+            new_width = old_width + pace * (tl.log(tl.where(chosen > 0, chosen, 1.0)) - old_width)
+            tl.store(log_bandwidth + channel, tl.where(chosen > 0, new_width, old_width).to(like))
             annealing = (step_count >= warmup) & (tl.sum(weight * tl.abs(residual), 0) > 0)
             change = 4.0 * anneal_step * tl.where(least_risk < initial_risk, 1.0, -1.0)
             before = tl.load(share + channel).to(like)
@@ -226,10 +221,9 @@ def channel_kernel(
         if HAS_SCALE:
             if not (SCALE or PEEK):
                 own, wider = tl.load(log_scale + channel), tl.load(half_range + channel)
-                least = tl.load(floor + channel)
             scale = tl.exp(own.to(tl.float64))
             bound = tl.maximum(wider.to(tl.float64), 10.0 * scale)
-            least = least.to(tl.float64)
+            least = 1e-3 * scale
         else:
             scale, bound, least = 1.0, 1.0, 0.0
         if OWN_BOUND:

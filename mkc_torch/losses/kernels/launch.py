@@ -71,7 +71,6 @@ class Running(NamedTuple):
     batches: Tensor | None = None
     log_scale: Tensor | None = None
     half_range: Tensor | None = None
-    floor: Tensor | None = None
     steps: Tensor | None = None
     log_bandwidth: Tensor | None = None
     share: Tensor | None = None

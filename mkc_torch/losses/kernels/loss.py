@@ -121,12 +121,12 @@ def request_of(loss: Any, device: torch.device) -> KernelRequest:
         own = scale._buffers
         if own["log_scale"].device != device:
             scale.to(device)  # a guide is not a submodule of the loss, and is not moved with it
-        running = Running(*(own[name] for name in Running._fields[:6]))
+        running = Running(*(own[name] for name in Running._fields[:5]))
         if schedule is not None:
             others = schedule._buffers
             if others["share"].device != device:
                 schedule.to(device)
-            running = Running(*running[:6], *(others[name] for name in Running._fields[6:]))
+            running = Running(*running[:5], *(others[name] for name in Running._fields[5:]))
             pace = (schedule.warmup_steps, schedule.anneal_step)
     given = (kappa, d, buffers.get("fixed_bound"), buffers.get("fixed_d_min"))
     return KernelRequest(*given, running, scale is not None and loss.training, *pace)
@@ -142,7 +142,7 @@ def updated_table(batch: Arranged, request: KernelRequest, options: Options, *, 
             batch, running, *numbers, options, scale=updates, peek=peek, schedule=scheduled, table=True, pace=pace
         )
     make_table(batch, running, *numbers, options, scale=True, table=False, pace=pace)
-    state = ScaleState(running.batches, running.log_scale, running.half_range, running.floor)
+    state = ScaleState(running.batches, running.log_scale, running.half_range)
     for own, joined in zip(state, synchronized_state(state), strict=True):
         own.copy_(joined)
     if scheduled:

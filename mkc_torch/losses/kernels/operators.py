@@ -17,7 +17,7 @@ from mkc_torch.losses.kernels.channels import TABLE
 from mkc_torch.losses.kernels.launch import Options, Running, arranged, pass_over, reduce_batch, weight_sums
 from mkc_torch.losses.kernels.loss import KernelRequest, gradients_of_each, options_of, request_of, updated_table
 
-_STATE = ("recent", "position", "batches", "log_scale", "half_range", "floor", "steps", "log_bandwidth", "share")
+_STATE = ("recent", "position", "batches", "log_scale", "half_range", "steps", "log_bandwidth", "share")
 
 
 @torch.library.custom_op("mkc_torch::channel_table", mutates_args=(*_STATE, "table"))
@@ -36,7 +36,6 @@ def channel_table(
     batches: Tensor | None,
     log_scale: Tensor | None,
     half_range: Tensor | None,
-    floor: Tensor | None,
     steps: Tensor | None,
     log_bandwidth: Tensor | None,
     share: Tensor | None,
@@ -46,7 +45,7 @@ def channel_table(
     anneal_step: float,
 ) -> None:
     """Update the running state and fill the table of the numbers of each channel, (14, m)."""
-    running = Running(recent, position, batches, log_scale, half_range, floor, steps, log_bandwidth, share)
+    running = Running(recent, position, batches, log_scale, half_range, steps, log_bandwidth, share)
     request = KernelRequest(kappa, d, bound, least, running, updates, warmup_steps, anneal_step)
     table.copy_(updated_table(arranged(input, target, weight, axis), request, Options(*options), updates=updates))
 

@@ -227,3 +227,17 @@ def test_fake_cuda_tensors_use_the_operators(device):
         value = torch.func.functional_call(loss, own, (x, y))
     assert value.shape == ()
     assert value.device.type == "cuda"
+
+
+@pytest.mark.filterwarnings("ignore:(overflow|invalid value) encountered:RuntimeWarning")  # of Triton's interpreter
+@pytest.mark.parametrize("size", [1e20, 3e38])
+def test_predictions_that_overflow_leave_the_state_of_eager_code(size):
+    kernel, eager = MKCLoss(2, impl="triton"), MKCLoss(2, impl="eager")
+    generator = torch.Generator().manual_seed(0)
+    for scale in (size, 1.0, 1.0, 1.0, size, 1.0):
+        x = torch.randn(40, 2, generator=generator).clamp(-1.0, 1.0)
+        for loss in (kernel, eager):
+            loss(scale * x, torch.zeros(40, 2))
+    for name, value in eager.state_dict().items():
+        assert value.isfinite().all()
+        torch.testing.assert_close(kernel.state_dict()[name], value, rtol=1e-4, atol=1e-6, msg=name)
