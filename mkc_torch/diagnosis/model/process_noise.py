@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted, no_first_fit, with_own_density
+from mkc_torch.diagnosis.model.fit import FULL, Effort, FittedModel, fitted, no_first_fit, with_own_density
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.settings import NoiseSettings
@@ -216,6 +216,7 @@ def fit_with_process_noise(
     *,
     more_starts: Sequence[Float[Tensor, " p"]] = (),
     model: JointModel | None = None,
+    effort: Effort = FULL,
 ) -> ProcessNoiseFit:
     """Fit a model under its most likely noise, from its open-loop fit.
 
@@ -225,6 +226,7 @@ def fit_with_process_noise(
         settings: of the noise.
         more_starts: parameters that predict over short horizons, to start from as well.
         model: the model, if there is no open-loop fit.
+        effort: how far each fit from the open-loop fit goes.
     """
     starts = 1 + len(more_starts)
     if free is not None and free.model.open_loop_only:
@@ -240,7 +242,7 @@ def fit_with_process_noise(
     if more_starts and system is not None:
         works.append(partial(_from_given, system, bound, declared, settings))
     if free is not None and not works:
-        works = [partial(under_noise, free, noise, declared, settings)]
+        works = [partial(under_noise, free, noise, declared, settings, effort)]
     tried = run_parallel(works, own.prepared)
     found = [pair for pair in tried if pair is not None]
     if not found:
@@ -302,7 +304,11 @@ _Found = tuple[FittedModel, StateSpaceNoise]
 
 
 def under_noise(
-    fit: FittedModel, noise: StateSpaceNoise | None, declared: Mapping[str, float], settings: NoiseSettings
+    fit: FittedModel,
+    noise: StateSpaceNoise | None,
+    declared: Mapping[str, float],
+    settings: NoiseSettings,
+    effort: Effort = FULL,
 ) -> _Found | None:
     """Alternate noise estimation and fit; return the most likely fit with the noise around it."""
     best: _Found | None = None
@@ -313,7 +319,7 @@ def under_noise(
         model = JointModel(fit.model.prepared.observed(noise.observer), fit.model.terms, near)
         try:
             # the open-loop trajectory may be far from that along the observer
-            fit = fitted(model, fit.parameters, fit.bound, graduate=False, fresh=True)
+            fit = fitted(model, fit.parameters, fit.bound, graduate=False, fresh=True, effort=effort)
         except NoFitError:
             break
         under, noise = noise, estimate_noise(fit, declared, settings, noise)

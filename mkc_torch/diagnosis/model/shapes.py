@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -375,7 +376,7 @@ def more_likely(other: FittedModel, fit: FittedModel) -> bool:
 
 
 def with_form_of_grid(
-    fit: FittedModel, effort: Effort = FULL, better: Better = more_likely, number: int = -1
+    fit: FittedModel, effort: Effort = FULL, criteria: Sequence[Better] = (more_likely,), number: int = -1
 ) -> FittedModel:
     """Return the fit with the form of an effect, such as a width, moved along its grid while the fit gets better.
 
@@ -385,16 +386,22 @@ def with_form_of_grid(
     Args:
         fit: with at least one effect, at its most likely parameters.
         effort: how far each fit goes.
-        better: compares two forms.
+        criteria: each compares two forms; applied one after the other.
         number: of the effect; default the last.
     """
     effect, prepared = fit.model.terms[number].effect, fit.model.prepared
-    for name in set(effect.form_parameters) & set(effect.relative):
+    names = set(effect.form_parameters) & set(effect.relative)
+    neighbours: dict[tuple[str, int], FittedModel | None] = {}
+    for better, name, steps in product(criteria, sorted(names), (-1, 1)):
         port = prepared.ports[fit.model.terms[number].port]
         grid = sorted({absolute(effect, shape, port)[name] for shape in effect.shapes(prepared.time)})
-        for steps in (-1, 1):
-            while (moved := _at_next(fit, number, name, grid, steps, effort)) is not None and better(moved, fit):
-                fit = moved
+        while True:
+            if (name, steps) not in neighbours:
+                neighbours[name, steps] = _at_next(fit, number, name, grid, steps, effort)
+            moved = neighbours[name, steps]
+            if moved is None or not better(moved, fit):
+                break
+            fit, neighbours = moved, {(name, -steps): fit}
     return fit
 
 

@@ -99,7 +99,7 @@ def _with(beam: Models, fit: FittedModel, addition: Addition) -> FittedModel | N
         return None
     found = under_its_noise(found, beam.declared, beam.settings.noise)
     for number in range(len(found.model.terms)):
-        found = with_form_of_grid(found, better=beam.is_better, number=number)
+        found = with_form_of_grid(found, criteria=(beam.is_better,), number=number)
     free = found.open_loop
     return free if free is not None and beam.value_of(free) > beam.value_of(found) else found
 

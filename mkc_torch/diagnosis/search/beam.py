@@ -11,7 +11,7 @@ from itertools import zip_longest
 import torch
 
 from mkc_torch._parallel.progress import report_bound, report_found
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.fit import FULL, SEARCH, Effort, FittedModel, fitted
 from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise, has_process_noise
 from mkc_torch.diagnosis.model.shapes import candidate_terms, shape_fitted, with_profiled_shape
 from mkc_torch.diagnosis.model.suspect import suspect_id
@@ -225,7 +225,7 @@ class BeamSearch:
                     less = None if known is None else known.fit
                     work = partial(fitted_in_form, fit, number, group, self.settings.noise, less)
                 else:
-                    work = partial(fitted_exchanged, fit, number, group, self.is_better)
+                    work = partial(fitted_exchanged, fit, number, group, self.settings.noise, self.is_better)
                 works.append((model_key([*rest, other]), move, work))
         orders = in_other_orders(fit)
         works += [(model_key(o), "another order in series", partial(fitted_reordered, fit, o)) for o in orders]
@@ -397,15 +397,16 @@ class BeamSearch:
     def _under_noise(self) -> None:
         """Fit the leading models under their process noise too; keep the fit that scores higher."""
         leading = sorted(self.models.values(), key=lambda model: -model.value)[:_NOISY]
-        works = [partial(self.under_noise, model) for model in leading]
+        works = [partial(self.under_noise, model, effort=SEARCH) for model in leading]
         self.keep(run_parallel(works, leading[0].fit.model.prepared, self.terms, "model"))
 
-    def under_noise(self, model: Candidate, less: float = 0.0) -> Candidate:
+    def under_noise(self, model: Candidate, less: float = 0.0, effort: Effort = FULL) -> Candidate:
         """Return a model fitted under its process noise, unless that scores lower by more than ``less`` nats."""
         if has_process_noise(model.fit):
             return model
         try:
-            noisy = shape_fitted(fit_with_process_noise(model.fit, self.declared, self.settings.noise).fit)
+            under = fit_with_process_noise(model.fit, self.declared, self.settings.noise, effort=effort)
+            noisy = shape_fitted(under.fit, effort)
         except NoFitError:
             return model
         return self._better(model, replace(noisy, squares=model.fit.squares), less)

@@ -22,10 +22,10 @@ from mkc_torch.diagnosis.model.fit import (
 )
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.process_noise import has_process_noise
-from mkc_torch.diagnosis.model.shapes import Better, shape_fitted, with_form_of_grid
+from mkc_torch.diagnosis.model.shapes import Better, more_likely, shape_fitted, with_form_of_grid
 from mkc_torch.diagnosis.model.simpler import simpler_start
 from mkc_torch.diagnosis.model.term import Key, Term
-from mkc_torch.diagnosis.search.moves import Addition, additions, at_size_zero
+from mkc_torch.diagnosis.search.moves import STARTS, Addition, additions, at_size_zero
 from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.impossible import impossible_values
@@ -192,8 +192,8 @@ def fitted_with(
     near += [found for other in others if (found := other()) is not None]
     polished = [_polished(found) for found in near]
     plausible = [found for found in polished if not implausible(found)]
-    found = with_form_of_grid(most_likely(plausible or polished), SEARCH)
-    return found if better is None else with_form_of_grid(found, SEARCH, better)
+    criteria = (more_likely,) if better is None else (more_likely, better)
+    return with_form_of_grid(most_likely(plausible or polished), SEARCH, criteria)
 
 
 def _polished(begun: FittedModel) -> FittedModel:
@@ -224,16 +224,18 @@ def fitted_without(fit: FittedModel, number: int) -> FittedModel | None:
 
 
 def fitted_exchanged(
-    fit: FittedModel, number: int, group: Sequence[Term], better: Better | None = None
+    fit: FittedModel, number: int, group: Sequence[Term], settings: NoiseSettings, better: Better | None = None
 ) -> FittedModel | None:
-    """Return the fit with another effect in place of one, from all shapes of its grid.
+    """Return the fit with another effect in place of one, from its first shape and those of the largest linear gain.
 
     ``better`` compares forms, as in :func:`fitted_with`.
     """
     rest = fitted_without(fit, number) if len(fit.model.terms) > 1 else _refitted(without_term(fit, number), fit)
     if rest is None:
         return None
-    return fitted_with(rest, at_size_zero(rest, group), better=better)
+    led = [start for addition in additions(rest, group[1:], settings) for start in addition.starts]
+    starts = (*at_size_zero(rest, group[:1]).starts, *led)[:STARTS]
+    return fitted_with(rest, Addition(starts, 0.0), better=better)
 
 
 def _refitted(start: FittedModel, like: FittedModel) -> FittedModel | None:

@@ -244,11 +244,11 @@ def _longest_run(prepared: PreparedSimulation) -> float:
 def special_cases(term: Term, terms: Sequence[Term], prepared: PreparedSimulation) -> list[Term]:
     """Return the candidates that are a special case of an effect, or that it is one of, at the same channels.
 
-    Of a dependence on a column also its other forms, which have the same special case. A common size is a special case
-    of a size for each recording.
+    Each at the first shape of its grid. Of a dependence on a column also its other forms, which have the same special
+    case. A common size is a special case of a size for each recording.
     """
     channels = prepared.ports[term.port].channels
-    found = []
+    found: dict[Key, Term] = {}
     for other in terms:
         pair = (term.effect, other.effect), (other.effect, term.effect)
         nested = any(
@@ -261,8 +261,8 @@ def special_cases(term: Term, terms: Sequence[Term], prepared: PreparedSimulatio
         nested = nested or (forms and not (is_relative(term.effect) or is_relative(other.effect)))
         alike = other.columns == term.columns or not (other.columns and term.columns)
         if nested and prepared.ports[other.port].channels == channels and alike:
-            found.append(other)
-    return found
+            found.setdefault(other.key, other)
+    return list(found.values())
 
 
 def _special_id(term: Term) -> str:
