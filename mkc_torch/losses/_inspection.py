@@ -40,7 +40,7 @@ def training_warnings(
             "targets, and the likelihood grows without limit as d -> 0: regularise, or stop earlier."
         )
     if input is not None and target is not None and loss.residual_scale is not None:
-        residual, share = _residuals(loss, input, target, weight)
+        residual, share, _ = _rows(loss, input, target, weight)
         size = weighted_quantile(torch, residual.abs().T, share.T, QUANTILE) / NORMAL_QUANTILE
         ratio = torch.where(loss.residual_scale.batches > 0, size / loss.residual_scale.scale, 0.0)
         wide = [int(k) for k in (ratio > OTHER_FIT_RATIO).nonzero().flatten()]
