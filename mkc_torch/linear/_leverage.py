@@ -8,8 +8,8 @@ import warnings
 import torch
 from torch import Tensor
 
-from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch._support.fisher_f import fisher_tail
+from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.linear.mm_regression import MMRegression
 
 _FEWEST = 10
