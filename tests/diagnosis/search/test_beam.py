@@ -91,7 +91,7 @@ def test_every_model_is_fitted_and_scored_once_for_each_hold(monkeypatch):
         scored.append((model_key(fit.model.terms), (tuple(fit.model.prepared.input_hold.items()), forms)))
         return score(fit, *others)
 
-    def refused(*_):
+    def refused(*_, **__):
         raise NoFitError("No noise is fitted here.")
 
     monkeypatch.setattr(beam_module, "score", counted)
