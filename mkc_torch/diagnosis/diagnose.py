@@ -11,7 +11,7 @@ from time import monotonic
 from mkc_torch._parallel.deadline import Stopped, limited
 from mkc_torch._parallel.progress import counting
 from mkc_torch.diagnosis.model.suspect import texts_of
-from mkc_torch.diagnosis.optional import optional_steps
+from mkc_torch.diagnosis.optional import optional, optional_steps
 from mkc_torch.diagnosis.pipeline.partial import (
     PartialResult,
     after_error,
@@ -26,6 +26,7 @@ from mkc_torch.diagnosis.pipeline.search import fit_baseline, stepwise_search
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.diagnosis.thresholds import LEVEL
+from mkc_torch.diagnosis.validation.whole import with_whole_recording
 from mkc_torch.diagnosis.verdict import EACH_OUTPUT, UNFIT, failed_rules
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
@@ -123,6 +124,8 @@ def diagnose(
     limit = math.inf if time_limit is None else time_limit
     with optional_steps() as failed:
         result = _with_or_without_restarts(problem, recording, limit, begin)
+        on_all = partial(with_whole_recording, result, problem.whole)
+        result = optional("predicting the whole recording", on_all, lambda: result)
     return replace(result, warnings=(*result.warnings, *failed))
 
 

@@ -12,7 +12,7 @@ from mkc_torch._support.arguments import checked_number, checked_whole, format_v
 from mkc_torch._support.arrays import is_frame
 from mkc_torch.diagnosis.declared import checked_input_hold, checked_noise
 from mkc_torch.diagnosis.model.suspect import refuse_unknown
-from mkc_torch.diagnosis.pipeline.stretch import in_stretches, quick_stretch
+from mkc_torch.diagnosis.pipeline.stretch import in_stretches
 from mkc_torch.diagnosis.settings import Settings, quick_settings
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.given_columns import EXPERIMENT
@@ -58,6 +58,7 @@ class Problem:
         recordings: names of the recordings that are diagnosed together; empty for a single recording.
         run_counts: number of runs in each of these recordings.
         progress: called with the name of each stage.
+        whole: all that was given, if the diagnosis uses stretches of it.
     """
 
     simulation: Simulation
@@ -67,6 +68,7 @@ class Problem:
     recordings: tuple[str, ...]
     run_counts: tuple[int, ...]
     progress: Callable[[str], object]
+    whole: Recording | None = None
 
     @property
     def where(self) -> str:
@@ -96,14 +98,12 @@ def prepare(
     refuse_no_settings(options.settings)
     _refuse_no_progress(progress)
     progress("reading the recording")
-    of_steps = isinstance(simulation, Dynamics) and simulation.steps is not None
-    if isinstance(simulation, Dynamics) and "time" in recording and not (options.quick and of_steps):
-        shorter = in_stretches(several or (recording,))
+    whole = recording
+    if isinstance(simulation, Dynamics) and "time" in recording:
+        shorter = in_stretches(several or (recording,), stepped=simulation.steps is not None, quick=options.quick)
         several = shorter if several else ()
         recording = joined(simulation, shorter if several else shorter[0])[0]
     prepared = simulation.prepare(recording)
-    stretch = quick_stretch(prepared, recording) if options.quick else None
-    prepared = prepared if stretch is None else simulation.prepare(stretch)
     _refuse_few(prepared)
     if len(prepared.time) < options.settings.search.fewest_samples:
         options = replace(options, quick=True, max_findings=0, suspect=(), too_few=True)
@@ -122,7 +122,8 @@ def prepare(
     prepared = prepared.with_input_hold(options.fixed)
     refuse_unknown(options.suspect, simulation, prepared, effects, settings.drivers)
     counts = run_counts(several) if names else ()
-    return Problem(simulation, prepared, effects, options, names, counts, progress)
+    parts = whole if len(whole) > len(recording) else None
+    return Problem(simulation, prepared, effects, options, names, counts, progress, parts)
 
 
 def _unjudged(options: SearchOptions, prepared: PreparedSimulation) -> bool:

@@ -1,90 +1,47 @@
-"""The stretches of a long recording that a diagnosis of differential equations or of a simulation that steps uses."""
+"""The stretches of a long recording that a diagnosis of a simulation with states uses."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from mkc_torch.recording.given_columns import EXPERIMENT
 from mkc_torch.recording.recording import Recording
-from mkc_torch.simulation.protocol import PreparedSimulation
 from mkc_torch.simulation.runs import experiment_runs
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-
-MOST = 1000
-"""Samples of a stretch. By judgement: a fit of each effect takes a simulation of all of them tens of times."""
 
 LONG = 10_000
 """Samples of differential equations that a diagnosis uses. By its cost: a pendulum takes 200 CPU seconds and 2.5 GB."""
 
+LONG_STEPPED = 1500
+"""The same of a simulation that steps, a fit of which takes tens of simulations of all samples at 0.1 ms each."""
+
+QUICK_STEPPED = 1000
+"""The same of a quick look."""
+
 _LENGTH = 2000
-"""Samples of each of its stretches, up to twice as many."""
+_LENGTH_STEPPED = 500
+"""Samples of each of their stretches, up to twice as many."""
 
 _ROUNDING = 1e-9
 """Relative difference of a column's levels from which they count as different."""
 
-_PLACES = 4
-"""Stretches that are compared start at each quarter of their length."""
 
-
-def quick_stretch(prepared: PreparedSimulation, recording: Recording) -> Recording | None:
-    """Return the stretch of a run in which the outputs move most, for a simulation that steps; None for any other.
-
-    Args:
-        prepared: the simulation with the whole recording.
-        recording: as given by the user.
-    """
-    system = prepared.dynamics
-    if system is None or system.system.steps is None or len(prepared.time) <= MOST or int(system.begins.sum()) > 1:
-        return None
-    first = first_of_liveliest(system.measured, MOST)
-    last = first + MOST
-    begin, end = (float(prepared.time[row]) for row in (first, last - 1))
-    note = (
-        f"Quick look at {MOST} of {len(prepared.time)} samples, from {begin:.4g} to {end:.4g} s, where the outputs "
-        "move most. Leave out --quick (in Python quick=True) to use all."
-    )
-    columns = {name: recording[name][first:last] for name in recording.names}
-    return Recording(
-        columns,
-        name=recording.name,
-        units=recording.units,
-        labels=recording.labels,
-        warnings=recording.warnings,
-        notes=(*recording.notes, note),
-    )
-
-
-def first_of_liveliest(values: Float[Tensor, "N m"], length: int) -> int:
-    """Return the first row of the stretch of a length in which the columns change most, each in its own scale.
-
-    Example:
-        >>> still, moving = torch.zeros(80, 1), torch.sin(torch.arange(40.0)).unsqueeze(-1)
-        >>> first_of_liveliest(torch.cat([still, moving, still]), 40)
-        80
-    """
-    known = values.nan_to_num()
-    moved = (known.diff(dim=0).abs() / known.std(0).clamp(min=1e-300)).sum(-1).cumsum(0)
-    starts = range(0, len(values) - length + 1, max(length // _PLACES, 1))
-    return max(starts, key=lambda row: float(moved[row + length - 2] - (moved[row - 1] if row else 0.0)))
-
-
-def in_stretches(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
-    """Return recordings of differential equations in stretches of about :data:`LONG` samples; shorter ones as they are.
+def in_stretches(recordings: Sequence[Recording], *, stepped: bool, quick: bool = False) -> tuple[Recording, ...]:
+    """Return recordings of a simulation with states in their most different stretches; short recordings as they are.
 
     Args:
         recordings: all that are diagnosed together; each keeps a share, and at least one stretch.
+        stepped: whether the simulation steps, instead of giving rates of change.
+        quick: whether the diagnosis is a quick look.
     """
+    most, length = (QUICK_STEPPED if quick else LONG_STEPPED, _LENGTH_STEPPED) if stepped else (LONG, _LENGTH)
     total = sum(map(len, recordings))
-    if total <= LONG:
+    if total <= most:
         return tuple(recordings)
-    return tuple(within_stretches(each, LONG * len(each) // total, _LENGTH) for each in recordings)
+    return tuple(within_stretches(each, most * len(each) // total, length) for each in recordings)
 
 
 def within_stretches(recording: Recording, most: int, length: int) -> Recording:

@@ -1,11 +1,11 @@
-"""The stretches of long recordings: of a quick look at a simulation that steps, and of any diagnosis."""
+"""The stretches of long recordings that a diagnosis uses, and its check on the whole recording."""
 
 import pytest
 import torch
 
 from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions, prepare
-from mkc_torch.diagnosis.pipeline.stretch import LONG, MOST, in_stretches, quick_stretch, within_stretches
+from mkc_torch.diagnosis.pipeline.stretch import LONG, LONG_STEPPED, QUICK_STEPPED, in_stretches, within_stretches
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.recording.join_recordings import join_recordings
 from tests.simulation.stepped.models import Equations
@@ -23,28 +23,24 @@ def rested(still, samples):
     return Recording({"time": time, **columns}, name="rested")
 
 
-def test_the_stretch_is_where_the_outputs_move_most():
-    recording = rested(still=700, samples=MOST)
-    found = quick_stretch(Servo().prepare(recording), recording)
-    assert found is not None
-    assert len(found) == MOST
-    # stretches begin at each quarter of their length
-    assert float(found["time"][0]) == pytest.approx(float(recording["time"][500]))
-    assert found.name == "rested"
-    assert f"Quick look at {MOST} of 1700 samples, from 10 to" in found.notes[-1]
-
-
-def test_a_short_recording_and_a_simulation_of_equations_are_used_whole():
-    short, long = followed(samples=MOST), rested(still=700, samples=MOST)
-    assert quick_stretch(Servo().prepare(short), short) is None
-    named = Recording({"time": long["time"], "torque": long["command"], "angle": long["angle"], "speed": long["angle"]})
-    assert quick_stretch(Equations().prepare(named), named) is None
+def test_a_simulation_that_steps_uses_the_liveliest_stretch_and_the_most_different_ones():
+    recording = rested(still=2000, samples=1000)
+    for quick, most in ((False, LONG_STEPPED), (True, QUICK_STEPPED)):
+        (found,) = in_stretches([recording], stepped=True, quick=quick)
+        assert most <= len(found) <= most + 1000
+        assert float(found["time"][-1]) == pytest.approx(float(recording["time"][-1]))
+        assert f"The diagnosis uses {len(found)} of 3000 samples" in found.notes[-1]
+    (short,) = in_stretches([followed(samples=QUICK_STEPPED)], stepped=True, quick=True)
+    assert len(short) == QUICK_STEPPED
+    assert not short.notes
 
 
 @pytest.mark.e2e
-def test_a_quick_look_states_its_stretch():
-    found = diagnose(Servo(), rested(still=400, samples=MOST), effects=(), quick=True)
-    assert [note for note in found.notes if note.startswith(f"Quick look at {MOST} of 1400 samples")]
+def test_a_diagnosis_of_stretches_gives_the_residuals_of_the_whole_recording():
+    found = diagnose(Servo(), rested(still=400, samples=1200), effects=(), quick=True)
+    assert [note for note in found.notes if note.startswith("The diagnosis uses 1000 of 1600 samples")]
+    (note,) = [note for note in found.notes if "of all 1600 samples, predicted in open loop: `angle` 0.0001" in note]
+    assert "findings" not in note
 
 
 def logged(samples, begin=0.0):
@@ -83,8 +79,8 @@ def test_stretches_lie_within_runs():
 
 def test_all_recordings_keep_a_share():
     recording = logged(LONG)
-    assert in_stretches([recording]) == (recording,)
-    short, long = in_stretches([logged(5000), logged(45_000)])
+    assert in_stretches([recording], stepped=False) == (recording,)
+    short, long = in_stretches([logged(5000), logged(45_000)], stepped=False)
     assert 2000 <= len(short) <= 4000
     assert LONG - 2000 <= len(short) + len(long) <= LONG + 4000
 
