@@ -21,7 +21,13 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Float64
 
 _STRIP = 1 << 13
-"""Rows whose products are formed at once; four times as many take three times as long."""
+"""Rows whose products are formed at once, at most; four times as many take three times as long."""
+
+_SERIAL = (1 << 15) - 1
+"""Values up to which torch multiplies without its threads, which wait for one another and for NumPy's threads."""
+
+_FEWEST = 1 << 10
+"""Rows of a strip at least, so that adding its products costs less than forming them."""
 
 PLAIN_KAPPA = 1e-2
 """κ from which differences of sums over κ and κ² lose at most four digits, so that three sums give all derivatives."""
@@ -69,8 +75,9 @@ def products(
         return torch.matmul((rows if weight is None else rows * weight.unsqueeze(-1)).mT, others)
     memory = Memory() if memory is None else memory
     total = np.zeros((rows.shape[1], others.shape[1]))
-    for first in range(0, rows.shape[0], _STRIP):
-        part = slice(first, first + _STRIP)
+    step = _STRIP if weight is None else min(max(_SERIAL // rows.shape[1], _FEWEST), _STRIP)
+    for first in range(0, rows.shape[0], step):
+        part = slice(first, first + step)
         strip = rows[part]
         if weight is not None:
             # torch multiplies rows of few columns by a weight five times as fast as NumPy
