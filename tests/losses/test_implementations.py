@@ -13,6 +13,9 @@ from mkc_torch import MKCLoss
 from mkc_torch.losses import _fused, bandwidth_schedule, mkc, residual_scale
 from mkc_torch.losses._bandwidth_selection import BandwidthSelection
 
+# gradients are compared, without an optimizer
+pytestmark = pytest.mark.filterwarnings("ignore:In 100 training steps")
+
 FIXED = {"learn_sigma": False, "learn_d": False}
 MODES = {
     "default": {},

@@ -471,7 +471,7 @@ def test_processes_share_the_geometric_mean_scale_and_the_widest_range(
 def test_processes_have_the_same_scale_and_schedule(processes, kind, place):
     left, other = (found[f"{kind}, {place}"] for found in processes)
     running = [name for name in left if name.startswith(("residual_scale", "schedule"))]
-    assert len(running) == 8
+    assert len(running) == 7
     assert {name: left[name] for name in running} == {name: other[name] for name in running}
     assert left["schedule.steps"] == [25, 25]
     scales = torch.tensor(left["residual_scale.log_scale"]).exp()
