@@ -28,6 +28,10 @@ _FOLLOWED = 0.5
 _LEVEL = 0.01
 """Significance of the distance between the two fits, in standard errors of the MM fit."""
 
+_MOVED = 1.0
+"""Mean squared distance from the weighted fit without the far rows, in its standard errors, below which no MM fit is
+made: good rows move a fit by less than its own error."""
+
 _SHOWN = 10
 """Most rows that the warning lists."""
 
@@ -51,7 +55,7 @@ def followed_rows(X: Tensor, Y: Tensor, coef: Tensor, weight: Tensor) -> list[in
     if not _FEWEST <= len(Y) <= _MOST or len(Y) <= 2 * X.shape[-1]:
         return []
     far = _far(X)
-    if not bool(far.any()):
+    if not bool((far & (weight > _FOLLOWED)).any()) or _moved(X, Y, coef, torch.where(far, 0.0, weight)) < _MOVED:
         return []
     robust = MMRegression().fit(X, Y)
     scale = float(robust.scale_)
@@ -65,6 +69,15 @@ def followed_rows(X: Tensor, Y: Tensor, coef: Tensor, weight: Tensor) -> list[in
     moved = float(difference @ torch.linalg.pinv(robust.covariance_, hermitian=True) @ difference) / len(coef)
     p_value = fisher_tail(torch.tensor(moved), torch.tensor(float(len(coef))), robust.dof_.clamp(min=1.0))
     return rows.nonzero().flatten().tolist() if float(p_value) < _LEVEL else []
+
+
+def _moved(X: Tensor, Y: Tensor, coef: Tensor, weight: Tensor) -> float:
+    """Mean squared distance of coefficients from a weighted fit, in standard errors of that fit."""
+    gram = X.mT @ (weight.unsqueeze(-1) * X)
+    difference = coef - torch.linalg.pinv(gram, hermitian=True) @ (X.mT @ (weight * Y))
+    residual = Y - X @ (coef - difference)
+    variance = (weight * residual.square()).sum() / weight.sum()
+    return float(difference @ gram @ difference / (variance * len(coef)).clamp(min=1e-300))
 
 
 def _far(X: Tensor) -> Tensor:

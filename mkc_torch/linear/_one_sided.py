@@ -31,6 +31,11 @@ _CLIP = 4.0
 """Largest residual in robust scales that counts for the skewness."""
 
 _STEPS = 30
+_CHECKED = 5
+"""Most steps to the narrower kernel's fit, and steps after which the size of the last is compared with all of them."""
+
+_SETTLED = 1e-3
+"""Share of the distance that the last step may have."""
 
 
 def one_sided_bias(problem: LinearProblem, beta: Tensor) -> Tensor:
@@ -41,12 +46,18 @@ def one_sided_bias(problem: LinearProblem, beta: Tensor) -> Tensor:
     if problem.num_channels > 1 or not bool(inexact.any()):
         return torch.zeros_like(beta)
     d = torch.where(inexact, scale, 1.0)
-    kappa, narrow = torch.full_like(d, _NARROW**-2), beta
-    for _ in range(_STEPS):
-        narrow = fixed_point_step(problem, problem.residual(narrow), kappa, d)
-    distance = torch.matmul(problem.to_coef, (beta - narrow).unsqueeze(-1)).squeeze(-1).abs()
     low, high = _SKEWED
     share = ((_skewness(problem, residual / d.unsqueeze(-2)) - low) / (high - low)).clamp(0.0, 1.0)
+    if not bool((share > 0.0).any()):
+        return torch.zeros_like(beta)
+    kappa, narrow = torch.full_like(d, _NARROW**-2), beta
+    for step in range(1, _STEPS + 1):
+        last, narrow = narrow, fixed_point_step(problem, problem.residual(narrow), kappa, d)
+        if step % _CHECKED == 0 and float((narrow - last).abs().amax()) <= _SETTLED * float(
+            (narrow - beta).abs().amax()
+        ):
+            break
+    distance = torch.matmul(problem.to_coef, (beta - narrow).unsqueeze(-1)).squeeze(-1).abs()
     bound = _MULTIPLE * share.sqrt().unsqueeze(-1) * distance
     return torch.where(inexact & bound.isfinite(), bound, 0.0)
 
