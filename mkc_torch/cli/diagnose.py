@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -26,6 +27,7 @@ from mkc_torch.cli.console import (
 )
 from mkc_torch.cli.diagnosis_request import (
     LEVEL,
+    MAGNETOMETER,
     MAX_FINDINGS,
     SIMULATIONS,
     SURROGATES,
@@ -60,6 +62,11 @@ from mkc_torch.cli.units_option import (
     reading_options,
     split_trailing_pairs,
 )
+
+if TYPE_CHECKING:
+    from mkc_torch.simulation import Simulation
+
+_MOST_NAMES = 5
 
 
 def diagnose(
@@ -140,10 +147,12 @@ def diagnose(
     """Find the physics that a simulation lacks: its place, size and form, the evidence, and the improvement.
 
     For each REC, diagnosis.json, model.json (for `mkc apply`) and report.html are written; with --together, one set
-    for all of them. The exit code is 0 if every recording was diagnosed, with or without findings, 1 if one was not,
-    and 3 if all were but a result is not usable unseen: the simulation does not fit, structure remains unexplained, no
-    finding is confirmed, the findings do not make the residual smaller, or a third of the samples was rejected.
-    Ctrl-C stops the search, writes the results so far and exits with 130; a second Ctrl-C exits at once.
+    for all of them. Several REC also get fleet.html, fleet.csv and fleet.json, which compare their findings; REC that
+    an earlier call with these options has completed are left as they are. The exit code is 0 if every recording was
+    diagnosed, with or without findings, 1 if one was not, and 3 if all were but a result is not usable unseen: the
+    simulation does not fit, structure remains unexplained, no finding is confirmed, the findings do not make the
+    residual smaller, or a third of the samples was rejected. Ctrl-C stops the search, writes the results so far and
+    exits with 130; a second Ctrl-C exits at once.
     """
     recordings, conversions = split_trailing_pairs(recordings, convert or [])
     request = Request(
@@ -170,11 +179,23 @@ def diagnose(
     with loading():
         from mkc_torch._parallel.processes import in_processes, keep_memory, one_thread
         from mkc_torch.cli.diagnosis_files import simulation_of
+        from mkc_torch.cli.fleet_files import Earlier, earlier_results, is_doubtful, write_fleet
         from mkc_torch.cli.joints import by_joints
-    total, failed, doubtful, left = 0, 0, False, list(recordings)
+    every, earlier = recordings, Earlier([], [])
+    total, failed, left = 0, 0, list(recordings)
     with interrupts_reported(lambda: not_written(left, output)):
-        _refuse_unusable(request, simulation_of)
-        works = [(path, each) for path in recordings for each in by_joints(path, request)]
+        name = _name_of_usable(request, simulation_of)
+        if len(recordings) > 1 and not together:
+            _claim(output)
+            earlier = earlier_results(recordings, output, request, name)
+            recordings = [path for path in recordings if path not in earlier.complete]
+            _print_done(earlier.complete)
+            left = list(recordings)
+        again = replace(request, force=True)
+        own = {path: again if path in earlier.interrupted else request for path in recordings}
+        works = [(path, each) for path in recordings for each in by_joints(path, own[path])]
+    failures: dict[str, str] = {}
+    doubtful = any(is_doubtful(output / path.stem) for path in earlier.complete)
     one_thread()
     keep_memory()
     look = ConsoleStyle.of(out())
@@ -193,15 +214,28 @@ def diagnose(
             total += len(outcomes)
             failed += sum(outcome.failed for outcome in outcomes)
             doubtful = doubtful or any(outcome.doubtful for outcome in outcomes)
+            failures.update((path.name, outcome.text) for outcome in outcomes if outcome.failed)
             if any(outcome.interrupted for outcome in outcomes):
                 raise KeyboardInterrupt
             if number + 1 == len(works) or works[number + 1][0] != path:
                 left.remove(path)
                 _join(output / path.stem, [own for other, own in works if other == path], step)
             step(None)
+    if len(every) > 1:
+        for written in write_fleet(every, output, failures):
+            typer.echo(f"written       {written}")
     if total > 1 and failed:
         err().print(f"mkc: {failed} of {total} recordings were not diagnosed.", soft_wrap=True)
     raise typer.Exit(1 if failed else DOUBTFUL if doubtful else 0)
+
+
+def _print_done(done: list[Path]) -> None:
+    if done:
+        names = ", ".join(path.name for path in done[:_MOST_NAMES]) + (", …" if len(done) > _MOST_NAMES else "")
+        which = "1 recording was diagnosed before and is left as it is"
+        if len(done) > 1:
+            which = f"{len(done)} recordings were diagnosed before and are left as they are"
+        err().print(f"mkc: {which}: {names}. --force repeats them.", soft_wrap=True)
 
 
 def _diagnosed(output: Path, look: ConsoleStyle, step: Steps | None, work: tuple[Path, Request]) -> list[Outcome]:
@@ -254,12 +288,24 @@ def _print_outcomes(outcomes: list[Outcome], step: Steps) -> None:
                 typer.echo(outcome.text, nl=False)
 
 
-def _refuse_unusable(request: Request, simulation_of: Callable[[Request], object]) -> None:
-    """Exit with one message, before anything is written, if the simulation cannot be loaded."""
-    if request.undecided:
-        return
+def _claim(output: Path) -> None:
+    """Exit with one message if the page of several recordings would replace a user's own file."""
+    from mkc_torch._support.files import claim_folder
+    from mkc_torch.cli.fleet_files import WRITTEN
+
     try:
-        simulation_of(request)
+        claim_folder(output, overwrite=True, files=WRITTEN)
+    except FAILURES as error:
+        complain(output, error)
+        raise typer.Exit(1) from None
+
+
+def _name_of_usable(request: Request, simulation_of: Callable[[Request], Simulation]) -> str:
+    """Return the simulation's name, or exit with one message, before anything is written, if it cannot be loaded."""
+    if request.undecided:
+        return MAGNETOMETER
+    try:
+        return simulation_of(request).name
     except FAILURES as error:
         complain(request.simulator_output or request.simulation, error)
         raise typer.Exit(1) from None

@@ -16,6 +16,7 @@ from torch import Tensor
 from mkc_torch.diagnosis.decisions import Trail
 from mkc_torch.diagnosis.environment import DisturbanceEstimate, NoiseEnvironment, ProcessNoise, ShapeCheck
 from mkc_torch.diagnosis.io.checks_json import checks_json
+from mkc_torch.diagnosis.io.conditions_json import conditions_json
 from mkc_torch.diagnosis.result import (
     Diagnosis,
     EffectParameter,
@@ -232,6 +233,7 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         **({"suspected": d.suspected} if d.suspected else {}),
         "decisions": decisions_json(d.decisions),
         "notes": d.notes,
+        "conditions": conditions_json(d.traces),
         "rejected_intervals": d.rejected_intervals,
     }
     content = _with_evidence(content, d.evidence, json_schema())

@@ -54,7 +54,7 @@ def test_keys_are_those_of_the_format(content):
         "schema", "recording", "simulation", "samples", "level", "p_value", "verdict", "answer", "doubts",
         "goodness_of_fit", "before_the_search", "reasons", "noise",
         "search", "findings", "disturbance", "remaining", "baseline", "corrected", "ceiling", "advice", "warnings",
-        "notes", "rejected_intervals", "decisions",
+        "notes", "conditions", "rejected_intervals", "decisions",
     }  # fmt: skip
     assert set(content["search"]) == {
         "candidates", "surrogates", "seed", "starts", "restart_after", "quick", "stopped",

@@ -1,0 +1,117 @@
+"""The page of several recordings that `mkc diagnose` diagnosed one by one, and which of them were done before."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mkc_torch._support.files import write_atomically
+from mkc_torch.cli.diagnosis_request import Request
+
+SCHEMA = "mkc-fleet/1"
+
+_FILE = "diagnosis.json"
+
+WRITTEN = ("fleet.html", "fleet.csv", "fleet.json")
+"""Files in the folder of the results."""
+
+
+class Earlier(NamedTuple):
+    """What an earlier call with the same options has left of some recordings: complete and interrupted results."""
+
+    complete: list[Path]
+    interrupted: list[Path]
+
+
+def earlier_results(paths: Sequence[Path], output: Path, request: Request, simulation: str) -> Earlier:
+    """Return the recordings whose results are complete, and those whose search was interrupted or reached a time limit.
+
+    Args:
+        paths: the recordings.
+        output: folder of the results.
+        request: options of this call; with ``force`` no result counts.
+        simulation: its name.
+    """
+    found = Earlier([], [])
+    for path in [] if request.force else paths:
+        contents = list(_contents(output / path.stem).values())
+        if contents and all(_has_options(each, request, simulation) for each in contents):
+            ended = all(each["search"]["stopped"] is None for each in contents)
+            (found.complete if ended else found.interrupted).append(path)
+    return found
+
+
+def _has_options(content: Mapping[str, Any], request: Request, simulation: str) -> bool:
+    search = content["search"]
+    found = (content["simulation"], content["level"], search["seed"], search["quick"])
+    return found == (simulation, request.level, request.seed, request.quick)
+
+
+def is_doubtful(folder: Path) -> bool:
+    """Whether a result of an earlier call must be looked at before it is used."""
+    return any(content.get("answer") != "usable" for content in _contents(folder).values())
+
+
+def write_fleet(paths: Sequence[Path], output: Path, failures: Mapping[str, str]) -> list[Path]:
+    """Write the page, the table and the numbers of all recordings that have a result. Returns the files.
+
+    Args:
+        paths: the recordings, each with a folder of its name in ``output``.
+        output: folder of the results.
+        failures: reasons by the names of recordings that were not diagnosed.
+    """
+    from mkc_torch.report.fleet import fleet_of, fleet_report
+
+    found: dict[str, Mapping[str, Any]] = {}
+    for path in paths:
+        for place, content in _contents(output / path.stem).items():
+            found[place.relative_to(output).as_posix()] = content
+    fleet = fleet_of(found, failures)
+    content = {"schema": SCHEMA, **_finite(asdict(fleet))}
+    texts = (fleet_report(fleet), _table(found), json.dumps(content, ensure_ascii=False, indent=2) + "\n")
+    for name, text in zip(WRITTEN, texts, strict=True):
+        write_atomically(output / name, text, overwrite=True)
+    return [output / name for name in WRITTEN]
+
+
+def _contents(folder: Path) -> dict[Path, Mapping[str, Any]]:
+    """Content of each diagnosis.json in a recording's folder, or in the folders of its runs or joints."""
+    places = [folder, *(sorted(each for each in folder.iterdir() if each.is_dir()) if folder.is_dir() else [])]
+    return {
+        place: json.loads((place / _FILE).read_text(encoding="utf-8")) for place in places if (place / _FILE).is_file()
+    }
+
+
+def _table(found: Mapping[str, Mapping[str, Any]]) -> str:
+    """A row for each parameter of each finding; a recording without findings has a row without effect."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    columns = ("recording", "verdict", "answer", "effect", "place", "drivers", "grade", "parameter", "value")
+    table.writerow([*columns, "standard_error", "unit"])
+    for name, content in found.items():
+        first = (name, content["verdict"], content.get("answer", ""))
+        if not content["findings"]:
+            table.writerow([*first, *[""] * 8])
+        for each in content["findings"]:
+            place = (each["effect"], "; ".join(each["channels"]), "; ".join(each["drivers"]), each["grade"])
+            for number in each["parameters"]:
+                error = number["standard_error"]
+                table.writerow(
+                    [*first, *place, number["name"], number["value"], "" if error is None else error, number["unit"]]
+                )
+    return text.getvalue()
+
+
+def _finite(content: Any) -> Any:
+    """Replace numbers that JSON does not have by None."""
+    if isinstance(content, Mapping):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
