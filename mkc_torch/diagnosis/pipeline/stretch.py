@@ -78,9 +78,10 @@ def within_stretches(recording: Recording, most: int, length: int) -> Recording:
     time, columns = recording["time"], {name: recording[name][rows] for name in recording.names if name != EXPERIMENT}
     labels = tuple(f"{float(time[first]):.6g} to {float(time[last - 1]):.6g} s" for first, last in parts)
     number = torch.arange(len(parts)).repeat_interleave(torch.tensor([last - first for first, last in parts]))
+    stretches = "a stretch" if len(parts) == 1 else f"{len(parts)} stretches of different levels and movements"
     note = (
-        f"The diagnosis uses {len(rows)} of {len(recording)} samples, in {len(parts)} stretches of different levels "
-        f"and movements: {', '.join(labels)}. `mkc apply` uses all."
+        f"The diagnosis uses {len(rows)} of {len(recording)} samples, in {stretches}: {', '.join(labels)}. `mkc apply` "
+        "uses all."
     )
     return Recording(
         {**columns, EXPERIMENT: number.double()},

@@ -1,5 +1,7 @@
 """The stretches of long recordings that a diagnosis uses, and its check on the whole recording."""
 
+import re
+
 import pytest
 import torch
 
@@ -38,9 +40,11 @@ def test_a_simulation_that_steps_uses_the_liveliest_stretch_and_the_most_differe
 @pytest.mark.e2e
 def test_a_diagnosis_of_stretches_gives_the_residuals_of_the_whole_recording():
     found = diagnose(Servo(), rested(still=400, samples=1200), effects=(), quick=True)
-    assert [note for note in found.notes if note.startswith("The diagnosis uses 1000 of 1600 samples")]
-    (note,) = [note for note in found.notes if "of all 1600 samples, predicted in open loop: `angle` 0.0001" in note]
-    assert "findings" not in note
+    assert [note for note in found.notes if note.startswith("The diagnosis uses 1066 of 1600 samples, in a stretch")]
+    (note,) = [note for note in found.notes if "of all 1600 samples" in note]
+    residual = re.search(r"predicted in open loop: `angle` (\S+) rad\.$", note)
+    assert residual is not None
+    assert float(residual[1]) == pytest.approx(1e-4, rel=0.3)
 
 
 def logged(samples, begin=0.0):

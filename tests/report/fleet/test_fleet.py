@@ -57,7 +57,7 @@ def test_sizes_that_differ_have_a_spread_and_a_recording_that_departs_is_named()
     assert "The others: mean 0." in text
 
 
-def test_an_effect_of_one_recording_and_one_of_some_are_told_apart():
+def test_an_effect_of_one_recording_is_stated_apart_from_one_of_some():
     diagnoses = drawn(3, 0.0) | {"own": content(0.2, effect="backlash"), "none": content()}
     text = " ".join(conclusions(fleet_of(diagnoses)))
     assert "in 3 of 5 recordings: 0.4" in text
