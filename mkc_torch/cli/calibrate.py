@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -33,6 +33,9 @@ from mkc_torch.cli.units_option import (
     reading_options,
     split_trailing_pairs,
 )
+
+if TYPE_CHECKING:
+    from mkc_torch.calibration import Calibration
 
 
 class Quantity(str, Enum):
@@ -97,7 +100,8 @@ def calibrate(
 ) -> None:
     """Calibrate a magnetometer: estimate offset, gains and cross-axis coupling while the sensor is turned.
 
-    A file with several magnetometers gets a calibration for each, in a subfolder of the sensor's name.
+    A file with several magnetometers gets a calibration for each, in a subfolder of the sensor's name. Several REC also
+    get fleet.html, fleet.csv and fleet.json, which compare their calibrations.
 
     The exit code is 0 if every recording was calibrated, 1 if one was not, and 3 if all were but a result is doubtful:
     the correction reduces no scatter, a third of the samples was rejected, or the sensor's offset changed.
@@ -124,8 +128,15 @@ def calibrate(
         from mkc_torch._parallel.processes import keep_memory
         from mkc_torch.calibration.aided.place import earth_field, parsed_date, parsed_place
         from mkc_torch.calibration.exports import Destination
-        from mkc_torch.cli.calibration_files import CalibrationRequest, calibrations_of, read_calibration
+        from mkc_torch.cli.calibration_files import (
+            CalibrationOutcome,
+            CalibrationRequest,
+            calibrations_of,
+            read_calibration,
+        )
         from mkc_torch.cli.calibration_results import show_results
+        from mkc_torch.cli.console import sentence_of
+        from mkc_torch.cli.fleet_files import claim_page, write_calibrations
     keep_memory()
     earth = None
     if place is not None and date is not None:
@@ -154,6 +165,10 @@ def calibrate(
     )
     shown_with = reading_options(names, conversions, unit_label, sensor)
     console, total, failed, doubtful, left = out(), 0, 0, 0, list(recordings)
+    done: dict[Path, Calibration] = {}
+    failures: dict[str, str] = {}
+    if len(recordings) > 1:
+        claim_page(output)
     with progress(len(recordings), output, lines=True) as step, interrupts_reported(lambda: not_written(left, output)):
         for path in recordings:
             results = list(calibrations_of(path, output / path.stem, request, force=force, step=step))
@@ -162,8 +177,16 @@ def calibrate(
             total += len(results)
             failed += counts.failed
             doubtful += counts.doubtful
+            for subject, outcome in results:
+                if isinstance(outcome, CalibrationOutcome):
+                    done[outcome.files[0].parent] = outcome.calibration
+                else:
+                    failures[subject] = sentence_of(outcome)
             left.remove(path)
             step(None)
+        if len(recordings) > 1:
+            for written in write_calibrations(done, output, failures):
+                console.print(f"written       {written}", soft_wrap=True)
     if total > 1 and failed:
         things = "recordings" if total == len(recordings) else "sensors"
         what = "not done in full" if request.exports or request.old else "not calibrated"

@@ -179,14 +179,14 @@ def diagnose(
     with loading():
         from mkc_torch._parallel.processes import in_processes, keep_memory, one_thread
         from mkc_torch.cli.diagnosis_files import simulation_of
-        from mkc_torch.cli.fleet_files import Earlier, earlier_results, is_doubtful, write_fleet
+        from mkc_torch.cli.fleet_files import Earlier, claim_page, earlier_results, is_doubtful, write_diagnoses
         from mkc_torch.cli.joints import by_joints
     every, earlier = recordings, Earlier([], [])
     total, failed, left = 0, 0, list(recordings)
     with interrupts_reported(lambda: not_written(left, output)):
         name = _name_of_usable(request, simulation_of)
         if len(recordings) > 1 and not together:
-            _claim(output)
+            claim_page(output)
             earlier = earlier_results(recordings, output, request, name)
             recordings = [path for path in recordings if path not in earlier.complete]
             _print_done(earlier.complete)
@@ -222,7 +222,7 @@ def diagnose(
                 _join(output / path.stem, [own for other, own in works if other == path], step)
             step(None)
     if len(every) > 1:
-        for written in write_fleet(every, output, failures):
+        for written in write_diagnoses(every, output, failures):
             typer.echo(f"written       {written}")
     if total > 1 and failed:
         err().print(f"mkc: {failed} of {total} recordings were not diagnosed.", soft_wrap=True)
@@ -286,18 +286,6 @@ def _print_outcomes(outcomes: list[Outcome], step: Steps) -> None:
                 err().print(f"mkc: {outcome.text}", soft_wrap=True)
             else:
                 typer.echo(outcome.text, nl=False)
-
-
-def _claim(output: Path) -> None:
-    """Exit with one message if the page of several recordings would replace a user's own file."""
-    from mkc_torch._support.files import claim_folder
-    from mkc_torch.cli.fleet_files import WRITTEN
-
-    try:
-        claim_folder(output, overwrite=True, files=WRITTEN)
-    except FAILURES as error:
-        complain(output, error)
-        raise typer.Exit(1) from None
 
 
 def _name_of_usable(request: Request, simulation_of: Callable[[Request], Simulation]) -> str:

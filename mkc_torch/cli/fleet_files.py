@@ -1,4 +1,4 @@
-"""The page of several recordings that `mkc diagnose` diagnosed one by one, and which of them were done before."""
+"""The page of several recordings that were diagnosed or calibrated one by one, and which of them were done before."""
 
 from __future__ import annotations
 
@@ -9,10 +9,17 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from mkc_torch._support.files import write_atomically
+import typer
+
+from mkc_torch._support.files import claim_folder, write_atomically
+from mkc_torch.cli.console import FAILURES, complain
 from mkc_torch.cli.diagnosis_request import Request
+
+if TYPE_CHECKING:
+    from mkc_torch.calibration import Calibration
+    from mkc_torch.report.fleet import Fleet
 
 SCHEMA = "mkc-fleet/1"
 
@@ -53,28 +60,52 @@ def _has_options(content: Mapping[str, Any], request: Request, simulation: str) 
     return found == (simulation, request.level, request.seed, request.quick)
 
 
+def claim_page(output: Path) -> None:
+    """Create the folder of the results; exit with one message if the page would replace a user's own file."""
+    try:
+        claim_folder(output, overwrite=True, files=WRITTEN)
+    except FAILURES as error:
+        complain(output, error)
+        raise typer.Exit(1) from None
+
+
 def is_doubtful(folder: Path) -> bool:
     """Whether a result of an earlier call must be looked at before it is used."""
     return any(content.get("answer") != "usable" for content in _contents(folder).values())
 
 
-def write_fleet(paths: Sequence[Path], output: Path, failures: Mapping[str, str]) -> list[Path]:
-    """Write the page, the table and the numbers of all recordings that have a result. Returns the files.
+def write_diagnoses(paths: Sequence[Path], output: Path, failures: Mapping[str, str]) -> list[Path]:
+    """Write the page, the table and the numbers of all recordings that have a diagnosis. Returns the files.
 
     Args:
         paths: the recordings, each with a folder of its name in ``output``.
         output: folder of the results.
         failures: reasons by the names of recordings that were not diagnosed.
     """
-    from mkc_torch.report.fleet import fleet_of, fleet_report
+    from mkc_torch.report.fleet import fleet_of
 
     found: dict[str, Mapping[str, Any]] = {}
     for path in paths:
         for place, content in _contents(output / path.stem).items():
             found[place.relative_to(output).as_posix()] = content
-    fleet = fleet_of(found, failures)
+    return _write(fleet_of(found, failures), output)
+
+
+def write_calibrations(
+    calibrations: Mapping[Path, Calibration], output: Path, failures: Mapping[str, str]
+) -> list[Path]:
+    """Write the same of all recordings that have a calibration; the keys are their folders."""
+    from mkc_torch.report.fleet import fleet_of_calibrations
+
+    found = {place.relative_to(output).as_posix(): calibration for place, calibration in calibrations.items()}
+    return _write(fleet_of_calibrations(found, failures), output)
+
+
+def _write(fleet: Fleet, output: Path) -> list[Path]:
+    from mkc_torch.report.fleet import fleet_report
+
     content = {"schema": SCHEMA, **_finite(asdict(fleet))}
-    texts = (fleet_report(fleet), _table(found), json.dumps(content, ensure_ascii=False, indent=2) + "\n")
+    texts = (fleet_report(fleet), _table(fleet), json.dumps(content, ensure_ascii=False, indent=2) + "\n")
     for name, text in zip(WRITTEN, texts, strict=True):
         write_atomically(output / name, text, overwrite=True)
     return [output / name for name in WRITTEN]
@@ -88,23 +119,20 @@ def _contents(folder: Path) -> dict[Path, Mapping[str, Any]]:
     }
 
 
-def _table(found: Mapping[str, Mapping[str, Any]]) -> str:
-    """A row for each parameter of each finding; a recording without findings has a row without effect."""
+def _table(fleet: Fleet) -> str:
+    """A row for each size of each recording; a recording without sizes has a row without effect."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    columns = ("recording", "verdict", "answer", "effect", "place", "drivers", "grade", "parameter", "value")
-    table.writerow([*columns, "standard_error", "unit"])
-    for name, content in found.items():
-        first = (name, content["verdict"], content.get("answer", ""))
-        if not content["findings"]:
-            table.writerow([*first, *[""] * 8])
-        for each in content["findings"]:
-            place = (each["effect"], "; ".join(each["channels"]), "; ".join(each["drivers"]), each["grade"])
-            for number in each["parameters"]:
-                error = number["standard_error"]
-                table.writerow(
-                    [*first, *place, number["name"], number["value"], "" if error is None else error, number["unit"]]
-                )
+    columns = ("recording", "result", "answer", "effect", "place", "grade", "parameter", "value", "standard_error")
+    table.writerow([*columns, "unit"])
+    for number, each in enumerate(fleet.recordings):
+        first = (each.name, each.verdict, each.answer)
+        own = [(q, size) for q in fleet.quantities for size in q.sizes if size.recording == number]
+        for q, size in own:
+            error = size.error if math.isfinite(size.error) else ""
+            table.writerow([*first, q.effect, q.place, size.grade, q.parameter, size.value, error, q.unit])
+        if not own:
+            table.writerow([*first, *[""] * 7])
     return text.getvalue()
 
 

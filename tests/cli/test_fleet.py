@@ -6,7 +6,7 @@ import json
 import pytest
 
 from mkc_torch.cli.diagnosis_request import Request
-from mkc_torch.cli.fleet_files import SCHEMA, WRITTEN, earlier_results, is_doubtful, write_fleet
+from mkc_torch.cli.fleet_files import SCHEMA, WRITTEN, earlier_results, is_doubtful, write_diagnoses
 from tests.cli.commands import assert_refused, mkc
 from tests.cli.test_diagnose import quiet_table
 from tests.report.fleet.test_fleet import content
@@ -49,7 +49,7 @@ def test_results_to_look_at_stay_doubtful(results):
 
 
 def test_the_files_have_every_run_and_every_size(results):
-    files = write_fleet(paths(results, "done", "runs", "failed"), results, {"failed.csv": "no time"})
+    files = write_diagnoses(paths(results, "done", "runs", "failed"), results, {"failed.csv": "no time"})
     assert [file.name for file in files] == list(WRITTEN)
     numbers = json.loads((results / "fleet.json").read_text(encoding="utf-8"))
     assert numbers["schema"] == SCHEMA

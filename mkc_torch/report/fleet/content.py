@@ -1,4 +1,4 @@
-"""What the diagnoses of several recordings have in common, from their diagnosis.json."""
+"""What the results of several recordings have in common, of diagnoses from their diagnosis.json."""
 
 from __future__ import annotations
 
@@ -102,14 +102,27 @@ class Quantity:
         """Effect and place in words."""
         return f"{self.effect.replace('_', ' ')}, {self.place}"
 
+    @property
+    def own_name(self) -> str:
+        """Name of the parameter if it is not that of the effect; else empty."""
+        return "" if self.parameter == self.effect else self.parameter
+
 
 @dataclass(frozen=True)
 class Fleet:
-    """The diagnoses of several recordings, and the recordings that were not diagnosed, with the reason."""
+    """The results of several recordings, and the recordings without a result, with the reason.
+
+    Attributes:
+        recordings: with a result.
+        quantities: their findings, or the numbers of their calibrations.
+        failures: reason by the name of each recording without a result.
+        kind: what was done with each recording, "diagnosed" or "calibrated".
+    """
 
     recordings: tuple[FleetRecording, ...]
     quantities: tuple[Quantity, ...]
     failures: Mapping[str, str]
+    kind: str = "diagnosed"
 
 
 def fleet_of(diagnoses: Mapping[str, Mapping[str, Any]], failures: Mapping[str, str] | None = None) -> Fleet:
@@ -136,7 +149,7 @@ def fleet_of(diagnoses: Mapping[str, Mapping[str, Any]], failures: Mapping[str, 
                 error = each["standard_error"]
                 size = Size(number, each["value"], math.nan if error is None else error, finding["grade"])
                 sizes.setdefault((finding["effect"], place, each["name"], each["unit"]), []).append(size)
-    quantities = [_compared(Quantity(*key, tuple(found)), recordings) for key, found in sizes.items()]
+    quantities = [compared(Quantity(*key, tuple(found)), recordings) for key, found in sizes.items()]
     quantities.sort(key=lambda quantity: -len(quantity.compared))
     return Fleet(recordings, tuple(quantities), {} if failures is None else failures)
 
@@ -162,7 +175,8 @@ def _recording(name: str, content: Mapping[str, Any]) -> FleetRecording:
     )
 
 
-def _compared(quantity: Quantity, recordings: Sequence[FleetRecording]) -> Quantity:
+def compared(quantity: Quantity, recordings: Sequence[FleetRecording]) -> Quantity:
+    """Return a quantity with mean, spread, departures and trends of its sizes, where they can be compared."""
     known = [size for size in quantity.compared if size.error > 0.0 and math.isfinite(size.value)]
     if len(known) < 2 or quantity.effect == "unknown":  # a curve without a name has no size to compare
         return quantity

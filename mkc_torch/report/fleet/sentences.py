@@ -16,15 +16,15 @@ _MOST_NAMES = 5
 
 
 def headline(fleet: Fleet) -> str:
-    """Return how many recordings can be used as they are.
+    """Return how many recordings have a result, and how many results can be used as they are.
 
     Example:
         >>> headline(Fleet((), (), {"a": "no such file"}))
         '0 of 1 recordings diagnosed'
     """
-    count, diagnosed = len(fleet.recordings) + len(fleet.failures), len(fleet.recordings)
+    count, done = len(fleet.recordings) + len(fleet.failures), len(fleet.recordings)
     usable = sum(each.answer == "usable" for each in fleet.recordings)
-    return f"{diagnosed} of {count} recordings diagnosed" + (f", {usable} usable" if diagnosed else "")
+    return f"{done} of {count} recordings {fleet.kind}" + (f", {usable} usable" if done else "")
 
 
 def conclusions(fleet: Fleet) -> list[str]:
@@ -36,7 +36,7 @@ def _of_quantity(fleet: Fleet, quantity: Quantity) -> Iterator[str]:
     found, all_of = quantity.compared, len(fleet.recordings)
     if not found:
         return
-    what = f"{quantity.title} (`{quantity.parameter}`)"
+    what = quantity.title + (f" (`{quantity.own_name}`)" if quantity.own_name else "")
     if len(found) == 1:
         if all_of > 1:
             yield f"In one recording: {what}, {written(found[0], quantity)} in {_names(fleet, found)}."
