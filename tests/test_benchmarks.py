@@ -1,6 +1,7 @@
 """The recordings of the benchmarks, and curves that end before their time limit."""
 
 import itertools
+import json
 from types import SimpleNamespace
 
 import pytest
@@ -10,7 +11,7 @@ pytest.importorskip("polars")
 pytest.importorskip("matplotlib")
 
 from mkc_torch import Recording
-from tests.benchmarks import diagnosis, fmu, samples, sizes
+from tests.benchmarks import diagnosis, fmu, ratios, samples, sizes
 
 
 def test_quaternions_turn_as_their_matrices_do():
@@ -95,3 +96,15 @@ def test_each_recording_is_diagnosed_with_the_model_in_torch_and_with_the_fmu(mo
     assert (pair.name, pair.same, pair.off) == ("thermal_00000", True, 0.0)
     assert [type(seen[0][0]), seen[1][0]] == [fmu.NOMINAL["thermal"], "FMU of thermal"]
     assert {name for _, name in seen} == {pair.name}
+
+
+def test_every_ratio_is_stored_and_one_that_has_outgrown_it_fails(monkeypatch, capsys):
+    own = ratios.pairs()
+    stored = json.loads(ratios.STORED.read_text(encoding="utf-8"))
+    assert [pair.name for pair in own] == list(stored)
+    monkeypatch.setattr(ratios, "pairs", lambda: own[1:3])
+    monkeypatch.setattr(ratios, "ratio_of", lambda pair: stored[pair.name] * (3.1 if pair is own[2] else 2.0))
+    assert ratios.main([]) == 1
+    assert f"{own[2].name}: 3 times as slow as stored" in capsys.readouterr().out
+    monkeypatch.setattr(ratios, "ratio_of", lambda pair: stored[pair.name])
+    assert ratios.main([]) == 0
