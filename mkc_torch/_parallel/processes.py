@@ -12,8 +12,10 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import contextmanager, suppress
-from typing import Protocol, TypeVar
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
+from typing import Any, Generic, Protocol, TypeVar
 
 import torch
 
@@ -79,33 +81,82 @@ def _at_exit() -> None:
 
 
 @contextmanager
-def in_processes(work: Callable[[T], R], items: Sequence[T]) -> Iterator[Iterator[Callable[[], R]]]:
+def in_processes(
+    work: Callable[[T], R], items: Sequence[T], workers: int | None = None
+) -> Iterator[Iterator[Callable[[], R]]]:
     """Start ``work`` on all items; yield for each item, in order, a function that waits for its result.
 
-    A single item is processed in this process. The function raises the error of ``work``, or
-    :class:`BrokenProcessPool` if the process of the item died.
+    A single item, and all items of a single worker, are processed in this process. ``workers`` is the largest number of
+    processes, by default one a core. If a process dies, the items that it and the others were working on are processed
+    once more. The function raises the error of ``work``, or :class:`BrokenProcessPool` if the process of the item died
+    twice.
     """
-    workers = min(len(items), cores())
+    workers = min(len(items), cores() if workers is None else workers)
     if workers < 2:
         yield (lambda item=item: work(item) for item in items)  # type: ignore[misc]
         return
     before = set(multiprocessing.active_children())
-    # torch's threads do not survive a fork
-    context = multiprocessing.get_context("spawn")
     # without a lock: an interrupt between its acquisition and its release would block all processes
-    stop = context.RawValue(ctypes.c_bool, False)
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(stop,)) as pool:
+    stop = _CONTEXT.RawValue(ctypes.c_bool, False)
+    with ExitStack() as pools:
+        pool = _Pool(work, items, workers, partial(_new_pool, pools, stop))
         try:
-            with _not_interrupted():  # new processes inherit it, and print no traceback at an interrupt
-                futures: list[Future[R]] = [pool.submit(_interruptible, work, item) for item in items]
-            yield (future.result for future in futures)
+            pool.submit(0)
+            yield (partial(pool.result, number) for number in range(len(items)))
         except BaseException:
             stop.value = True  # a started item cannot be cancelled
             for child in set(multiprocessing.active_children()) - before:
                 with suppress(ProcessLookupError, TypeError):
                     os.kill(child.pid, signal.SIGINT)  # type: ignore[arg-type]
-            pool.shutdown(cancel_futures=True)
+            for future in pool.futures:
+                future.cancel()
             raise
+
+
+# torch's threads do not survive a fork
+_CONTEXT = multiprocessing.get_context("spawn")
+
+
+def _new_pool(pools: ExitStack, stop: Any, workers: int) -> ProcessPoolExecutor:
+    return pools.enter_context(ProcessPoolExecutor(workers, mp_context=_CONTEXT, initializer=_start, initargs=(stop,)))
+
+
+class _Pool(Generic[T, R]):
+    """Items in processes, which are replaced if one of them dies."""
+
+    def __init__(
+        self, work: Callable[[T], R], items: Sequence[T], workers: int, start: Callable[[int], ProcessPoolExecutor]
+    ) -> None:
+        self._work, self._items, self._workers, self._start = work, items, workers, start
+        self.futures: list[Future[R]] = []
+
+    def submit(self, first: int) -> None:
+        """Submit all items from a number on that have no result."""
+        with _not_interrupted():  # new processes inherit it, and print no traceback at an interrupt
+            pool, known = self._start(self._workers), self.futures[first:]
+            kept = [future if _has_ended(future) else None for future in known] or [None] * len(self._items)
+            self.futures[first:] = [
+                pool.submit(_interruptible, self._work, item) if future is None else future
+                for item, future in zip(self._items[first:], kept, strict=True)
+            ]
+
+    def result(self, number: int) -> R:
+        """Wait for the result of an item."""
+        with suppress(BrokenProcessPool):
+            return self.futures[number].result()
+        # whose process died is not known: this item is processed again alone, then the others in new processes
+        with _not_interrupted():
+            again = self._start(1).submit(_interruptible, self._work, self._items[number])
+        try:
+            return again.result()
+        finally:
+            if again.done() and number + 1 < len(self._items):
+                self.submit(number + 1)
+
+
+def _has_ended(future: Future[Any]) -> bool:
+    """Whether an item has a result or an error of its own."""
+    return future.done() and not future.cancelled() and not isinstance(future.exception(), BrokenProcessPool)
 
 
 class _Stop(Protocol):

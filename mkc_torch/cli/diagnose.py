@@ -142,6 +142,9 @@ def diagnose(
         str | None,
         typer.Option(metavar="SECONDS", help="Stop the search of each REC after this time; write the results so far."),
     ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Processes for several REC; default: one a core.")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
 ) -> None:
     """Find the physics that a simulation lacks: its place, size and form, the evidence, and the improvement.
@@ -205,7 +208,7 @@ def diagnose(
         interrupts_reported(lambda: not_written(left, output)),
         progress(len(works), output, lines=True) as step,
         # a single recording is diagnosed in this process, so that its run can be shown
-        in_processes(partial(_diagnosed, output, look, step if len(works) == 1 else None), works) as results,
+        in_processes(partial(_diagnosed, output, look, step if len(works) == 1 else None), works, workers) as results,
     ):
         for number, ((path, each), result) in enumerate(zip(works, results, strict=True)):
             step(f"diagnosing {path.name}{''.join(f', {joint}' for joint in each.joints)}")
@@ -274,7 +277,7 @@ def _waited_for(result: Callable[[], list[Outcome]], path: Path) -> list[Outcome
     try:
         return result()
     except BrokenProcessPool:
-        return [Outcome(f"{path}: the process ended, perhaps out of memory; diagnose this file alone.", True)]
+        return [Outcome(f"{path}: the process ended twice, perhaps out of memory; diagnose this file alone.", True)]
 
 
 def _print_outcomes(outcomes: list[Outcome], step: Steps) -> None:

@@ -7,6 +7,7 @@ import sys
 import pytest
 import torch
 
+from mkc_torch._parallel import processes as _processes
 from mkc_torch._parallel.processes import cores, keep_memory
 
 
@@ -87,3 +88,50 @@ def test_interrupt_while_reading_the_stop_flag_does_not_block(tmp_path):
     script.write_text(INTERRUPTED)
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout == "stopped\n"
+
+
+DYING = """
+import os, signal
+from pathlib import Path
+
+from mkc_torch._parallel.processes import in_processes
+
+
+def work(item):
+    name, folder, times = item
+    begun = len(list(Path(folder).glob(f"{name}_*")))
+    (Path(folder) / f"{name}_{begun}").touch()
+    if begun < times:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if name == "wrong":
+        raise ValueError("own error")
+    return name, begun
+
+
+if __name__ == "__main__":
+    import sys
+    items = [(name, sys.argv[1], times) for name, times in (("a", 0), ("dies", 1), ("wrong", 0), ("lost", 9), ("b", 0))]
+    with in_processes(work, items, 2) as results:
+        for result in results:
+            try:
+                print(*result())
+            except Exception as error:
+                print(type(error).__name__)
+"""
+
+
+@pytest.mark.process
+def test_items_of_a_process_that_dies_are_processed_once_more(tmp_path):
+    script, folder = tmp_path / "dying.py", tmp_path / "begun"
+    script.write_text(DYING)
+    folder.mkdir()
+    command = [sys.executable, str(script), str(folder)]
+    output = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout.splitlines()
+    names = [line.split()[0] for line in output]
+    assert names == ["a", "dies", "ValueError", "BrokenProcessPool", "b"]
+    assert output[1] == "dies 1"
+
+
+def test_a_single_worker_is_this_process():
+    with _processes.in_processes(lambda _: os.getpid(), range(3), 1) as results:
+        assert {result() for result in results} == {os.getpid()}
