@@ -24,7 +24,10 @@ _STRIP = 1 << 13
 """Rows whose products are formed at once, at most; four times as many take three times as long."""
 
 _SERIAL = (1 << 15) - 1
-"""Values up to which torch multiplies without its threads, which wait for one another and for NumPy's threads."""
+_SERIAL_PRODUCTS = 1 << 18
+_SERIAL_DOT = 10_000
+"""Values that torch multiplies, products of a matrix product and rows of a scalar product up to which torch and
+OpenBLAS start no threads: two pools of threads wait for one another, and for other programs on a busy machine."""
 
 _FEWEST = 1 << 10
 """Rows of a strip at least, so that adding its products costs less than forming them."""
@@ -75,7 +78,8 @@ def products(
         return torch.matmul((rows if weight is None else rows * weight.unsqueeze(-1)).mT, others)
     memory = Memory() if memory is None else memory
     total = np.zeros((rows.shape[1], others.shape[1]))
-    step = _STRIP if weight is None else min(max(_SERIAL // rows.shape[1], _FEWEST), _STRIP)
+    n, j = rows.shape[1], others.shape[1]
+    step = min(max(_SERIAL // n, _FEWEST), max(_SERIAL_PRODUCTS // (n * j), _FEWEST), _STRIP)
     for first in range(0, rows.shape[0], step):
         part = slice(first, first + step)
         strip = rows[part]
@@ -184,8 +188,8 @@ class BlockSums:
             w *= own
         do.multiply(w, e, out=s)
         do.multiply(s, q, out=t)
-        qw, q2w = (0.5 * precision * self._number(do.dot(v, e)) for v in (s, t))
-        residual = self._number(e.sum() if own is None else do.dot(own, e))
+        qw, q2w = (0.5 * precision * self._number(self._dot(v, e)) for v in (s, t))
+        residual = self._number(e.sum() if own is None else self._dot(own, e))
         energy = self._energy(c, vectors[1], w, own, qw, q2w)
         for row, value in enumerate((residual, *energy, qw, q2w), 1):
             self._channels[row, c] += value
@@ -231,7 +235,12 @@ class BlockSums:
             scored.addcmul_(rows, vectors[3].unsqueeze(-1))
         plain = e if own is None else do.multiply(own, e, out=t)
         self._moment[c] += do.matmul(plain, self._native(rows))
-        self._square[c] += do.dot(plain, e)
+        self._square[c] += self._dot(plain, e)
+
+    def _dot(self, values: Any, others: Any) -> Any:
+        do, count = self._operations, len(values)
+        step = _SERIAL_DOT if self._on_cpu else max(count, 1)
+        return sum(do.dot(values[k : k + step], others[k : k + step]) for k in range(0, count, step))
 
     def _native(self, values: Any) -> Any:
         return values.numpy() if self._on_cpu and isinstance(values, Tensor) else values
