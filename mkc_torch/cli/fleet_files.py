@@ -61,7 +61,9 @@ def _has_options(content: Mapping[str, Any], request: Request, simulation: str) 
 
 
 def claim_page(output: Path) -> None:
-    """Create the folder of the results; exit with one message if the page would replace a user's own file."""
+    """Exit with one message if the page would replace a user's own file."""
+    if not output.exists():
+        return
     try:
         claim_folder(output, overwrite=True, files=WRITTEN)
     except FAILURES as error:

@@ -22,8 +22,10 @@ QUICK_STEPPED = 1000
 """The same of a quick look."""
 
 _LENGTH = 2000
+"""Samples of a stretch of differential equations, up to twice as many."""
+
 _LENGTH_STEPPED = 500
-"""Samples of each of their stretches, up to twice as many."""
+"""The same of a simulation that steps."""
 
 _ROUNDING = 1e-9
 """Relative difference of a column's levels from which they count as different."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -146,12 +146,25 @@ def fleet_of(diagnoses: Mapping[str, Mapping[str, Any]], failures: Mapping[str, 
         for finding in content["findings"]:
             place = ", ".join([*finding["channels"], *(f"by {driver}" for driver in finding["drivers"])])
             for each in finding["parameters"]:
-                error = each["standard_error"]
-                size = Size(number, each["value"], math.nan if error is None else error, finding["grade"])
-                sizes.setdefault((finding["effect"], place, each["name"], each["unit"]), []).append(size)
+                for name, value, error in _components(each, finding["channels"]):
+                    size = Size(number, value, error, finding["grade"])
+                    sizes.setdefault((finding["effect"], place, name, each["unit"]), []).append(size)
     quantities = [compared(Quantity(*key, tuple(found)), recordings) for key, found in sizes.items()]
     quantities.sort(key=lambda quantity: -len(quantity.compared))
     return Fleet(recordings, tuple(quantities), {} if failures is None else failures)
+
+
+def _components(parameter: Mapping[str, Any], channels: Sequence[str]) -> Iterator[tuple[str, float, float]]:
+    """Name, value and error of a parameter, or of each of its components, such as those of the sensor's axes."""
+    name, value, error = parameter["name"], parameter["value"], parameter["standard_error"]
+    if not isinstance(value, list):
+        yield name, value, math.nan if error is None else error
+        return
+    parts = channels if len(channels) == len(value) else [str(number) for number in range(1, len(value) + 1)]
+    errors = error if isinstance(error, list) else [error] * len(value)
+    for part, own, own_error in zip(parts, value, errors, strict=True):
+        component = {"name": f"{name}, {part}", "value": own, "standard_error": own_error}
+        yield from _components(component, channels)
 
 
 def _recording(name: str, content: Mapping[str, Any]) -> FleetRecording:

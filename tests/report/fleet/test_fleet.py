@@ -80,6 +80,23 @@ def test_unconfirmed_sizes_are_compared_and_nearest_effects_are_not():
     assert "0.900 ± 0.010 1/m (nearest)" in fleet_report(fleet)
 
 
+def test_components_of_a_vector_are_compared_one_by_one():
+    diagnoses = {}
+    for name, y in (("a", 0.2), ("b", 0.3)):
+        one = content([0.5, y], error=[0.01, 0.01])
+        one["findings"][0]["channels"] = ["x", "y"]
+        diagnoses[name] = one
+    x, y = fleet_of(diagnoses).quantities
+    assert (x.parameter, y.parameter) == ("drag, x", "drag, y")
+    assert x.pooled.agree
+    assert y.pooled.mean == pytest.approx(0.25)
+    unknown = content([[0.5, 0.2]], error=[[0.01, None]])
+    assert [q.parameter for q in fleet_of({"a": unknown}).quantities] == [
+        "drag, rate of speed, 1",
+        "drag, rate of speed, 2",
+    ]
+
+
 @pytest.mark.parametrize("error", [None, 0.0])
 def test_sizes_without_an_error_are_listed_and_not_compared(error):
     fleet = fleet_of({name: content(0.4, error=error) for name in "ab"})
