@@ -30,7 +30,7 @@ def raw_readings(
         unit: the final unit.
 
     Returns:
-        ``mag_x``, ``mag_y`` and ``mag_z`` before the correction; empty if there is none, or it is unknown.
+        ``mag_x``, ``mag_y`` and ``mag_z`` before the correction; empty without a known correction.
     """
     source = tuple(columns.get(name, name) for name in _MAG)
     known = topic.correction
@@ -59,7 +59,7 @@ def raw_readings(
 
 
 def corrected_already(notes: Iterable[str]) -> str:
-    """The note on a correction before logging that is not undone; empty if there is none.
+    """The note on a correction before logging that is not undone; empty without such a note.
 
     Example:
         >>> corrected_already(["`mag_x`: converted from mGauss, as the file says, to µT."])

@@ -92,6 +92,7 @@ def test_interrupt_while_reading_the_stop_flag_does_not_block(tmp_path):
 
 DYING = """
 import os, signal
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 from mkc_torch._parallel.processes import in_processes
@@ -115,7 +116,7 @@ if __name__ == "__main__":
         for result in results:
             try:
                 print(*result())
-            except Exception as error:
+            except (ValueError, BrokenProcessPool) as error:
                 print(type(error).__name__)
 """
 

@@ -74,7 +74,7 @@ class Topic(NamedTuple):
         units: units that the format states, by column: ``{"timestamp": "us", "x": "gauss"}``.
         warnings: what was found or dropped while the table was read.
         restarts: row indices at which the logger restarted, by a repeated header.
-        correction: correction of a magnetometer before its field was logged; None if there is none.
+        correction: correction of a magnetometer before its field was logged; None for a field as measured.
     """
 
     name: str
